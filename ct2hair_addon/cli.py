@@ -1,0 +1,268 @@
+"""The command line: synthesize | reconstruct | evaluate | convert. Options of `reconstruct` are made from `settings.py`.
+
+Exit codes: 0 done, 1 refused with a clear error, 2 wrong usage, 130 cancelled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from . import __version__
+from .errors import Cancelled, CT2HairError
+from .settings import PRESETS, Settings, parameters
+
+DONE, REFUSED, WRONG_USAGE, STOPPED = 0, 1, 2, 130
+SHORT_NAMES = {
+    "scan.spacing": "--spacing",
+    "head.mesh": "--head",
+    "head.face": "--face",
+    "head.up": "--up",
+    "interpolation.strands": "--strands",
+    "run.seed": "--seed",
+    "run.threads": "--threads",
+    "run.memory": "--memory",
+}
+"""Options that are asked for so often that the stage's name is left out."""
+_TYPES = {"float": float, "int": int, "str": str}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run one command; returns the exit code. Errors go to standard error as one readable line."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        return chosen.run(chosen)
+    except CT2HairError as error:
+        print(f"ct2hair: error: {error}", file=sys.stderr)
+        return REFUSED
+    except (Cancelled, KeyboardInterrupt):
+        print("ct2hair: cancelled; finished stages are kept", file=sys.stderr)
+        return STOPPED
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _interrupt(*_) -> None:
+    raise KeyboardInterrupt
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="ct2hair", description="Hair strands from a CT scan of a wig.")
+    parser.add_argument("--version", action="version", version=f"ct2hair {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in (_add_synthesize, _add_reconstruct, _add_evaluate, _add_convert):
+        add(commands)
+    return parser
+
+
+def _add_command(commands, name: str, run, help: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=help, description=help, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _add_reconstruct(commands) -> None:
+    parser = _add_command(commands, "reconstruct", _reconstruct, "reconstruct the hair of a scan into a folder")
+    parser.add_argument("scan", type=Path, help="the CT volume: .vdb .npy .raw .tif .nii .nrrd .mha, or a folder of slices")
+    parser.add_argument("--out", type=Path, required=True, help="folder for hair.npz, guides.npz, head.obj and the report")
+    parser.add_argument("--preset", choices=list(PRESETS), default="standard", help="speed against quality")
+    parser.add_argument("--settings", type=Path, help="JSON file of settings, over the preset")
+    _add_raw_options(parser)
+    for name, known in parameters():
+        short = SHORT_NAMES.get(name)
+        option = short or "--" + name.replace(".", "-").replace("_", "-")
+        unit = f" [{known.metadata['unit']}]" if known.metadata["unit"] else ""
+        parser.add_argument(
+            option,
+            dest=name,
+            type=_TYPES[known.type],
+            choices=known.metadata["choices"] or None,
+            default=argparse.SUPPRESS,
+            metavar=None if known.metadata["choices"] else option.lstrip("-").split("-")[-1].upper(),
+            help=f"{known.metadata['help']}{unit} (preset's value, {known.default!r} in standard)".replace("%", "%%"),
+        )
+
+
+def _add_raw_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--raw-shape", type=_shape, metavar="X,Y,Z", help="voxels of a .raw scan, x fastest")
+    parser.add_argument("--raw-type", metavar="TYPE", help="numpy type of a .raw scan, such as <u2 or >i2")
+
+
+def _shape(text: str) -> tuple[int, int, int]:
+    try:
+        x, y, z = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected three whole numbers such as 512,512,300, got {text!r}") from None
+    return x, y, z
+
+
+def _reconstruct(chosen: argparse.Namespace) -> int:
+    settings = Settings.preset(chosen.preset)
+    if chosen.settings:
+        settings = settings.changed(_settings_file(chosen.settings))
+    known = dict(parameters())
+    settings = settings.changed({name: value for name, value in vars(chosen).items() if name in known})
+    from . import pipeline  # late: it loads numba and torch
+
+    result = pipeline.reconstruct(
+        chosen.scan,
+        chosen.out,
+        settings,
+        raw_shape=chosen.raw_shape,
+        raw_type=chosen.raw_type,
+        observer=TerminalObserver(),
+    )
+    print(
+        f"{len(result.hair)} strands from {len(result.guides)} guides in {result.seconds:.0f} s: {chosen.out / 'hair.npz'}\n"
+        f"report: {chosen.out / 'report.html'}"
+    )
+    return DONE
+
+
+def _settings_file(path: Path) -> dict[str, Any]:
+    """Dotted names and values of a JSON file of settings."""
+    try:
+        nested = json.loads(path.read_text())
+        return {f"{stage}.{name}": value for stage, group in nested.items() for name, value in group.items()}
+    except OSError as error:
+        raise CT2HairError(f"{path}: can't be read ({error.strerror})") from error
+    except (json.JSONDecodeError, AttributeError) as error:
+        raise CT2HairError(f'{path}: not a file of settings, {{"stage": {{"name": value}}}} ({error})') from error
+
+
+class TerminalObserver:
+    """Progress on standard error: one line that is rewritten in a terminal, a line every tenth elsewhere."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._told = -1
+        self._last = 0.0
+
+    def started(self, stage: str, text: str) -> None:
+        if not self._live:
+            print(f"ct2hair: {text}", file=sys.stderr, flush=True)
+
+    def warned(self, text: str) -> None:
+        print(f"{self._clear()}ct2hair: warning: {text}", file=sys.stderr, flush=True)
+
+    def progressed(self, stage: str, fraction: float, total: float, remaining: float | None) -> None:
+        left = "" if remaining is None else f", {remaining:.0f} s left"
+        if self._live:
+            if time.monotonic() - self._last > 0.2 or total >= 1.0:
+                self._last = time.monotonic()
+                end = "\n" if total >= 1.0 else ""
+                print(f"{self._clear()}ct2hair: {total:4.0%} {stage}{left}", end=end, file=sys.stderr, flush=True)
+        elif int(10 * total) > self._told:
+            self._told = int(10 * total)
+            print(f"ct2hair: {total:4.0%}{left}", file=sys.stderr, flush=True)
+
+    def _clear(self) -> str:
+        return "\r\x1b[K" if self._live else ""
+
+
+def _add_synthesize(commands) -> None:
+    parser = _add_command(commands, "synthesize", _synthesize, "make a raw CT scan of a procedural hairstyle or of strands")
+    parser.add_argument(
+        "hair", metavar="STYLE|STRANDS", help="name of a hairstyle, or a file of strands (.npz .data .bin .hair)"
+    )
+    parser.add_argument("--spacing", type=float, required=True, metavar="MM", help="voxel size of the scan [mm]")
+    parser.add_argument("--out", type=Path, required=True, metavar="SCAN", help="the scan; its ending says the format")
+    parser.add_argument(
+        "--head", type=Path, metavar="MESH", help="OBJ of the head; without one the template is fitted to the roots"
+    )
+    parser.add_argument("--strands", type=int, default=8000, metavar="N", help="strands of a hairstyle")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the hairstyle and of the noise")
+    parser.add_argument("--snr", type=float, default=4.0, metavar="S", help="a lone strand's peak over the noise")
+    parser.add_argument("--blur", type=float, default=0.85, metavar="VOXELS", help="the scanner's blur, a Gaussian sigma")
+    parser.add_argument("--clean", action="store_true", help="blurred hair only: no noise, no air, no mannequin, no net")
+    parser.add_argument("--no-mannequin", action="store_true", help="leave the mannequin out")
+    parser.add_argument("--no-net", action="store_true", help="leave the hairnet and its knots out")
+
+
+def _synthesize(chosen: argparse.Namespace) -> int:
+    from .evaluation import STYLES, hairstyle, synthesize
+    from .head import load_obj, mark_scalp, template_head
+    from .strand_files import read_strands
+
+    if chosen.hair in STYLES:
+        head = load_obj(chosen.head) if chosen.head else template_head()
+        strands = hairstyle(chosen.hair, head, chosen.strands, chosen.seed)
+    elif Path(chosen.hair).suffix:
+        strands = read_strands(chosen.hair)
+        head = load_obj(chosen.head, align=False, need_scalp=False) if chosen.head else None
+        if head is not None and not len(head.scalp_faces):
+            head = mark_scalp(head, strands.roots)
+    else:
+        raise CT2HairError(f"'{chosen.hair}' is neither a hairstyle ({', '.join(STYLES)}) nor a file of strands")
+    made = synthesize(
+        strands,
+        head,
+        chosen.out,
+        chosen.spacing,
+        snr=chosen.snr,
+        clean=chosen.clean,
+        seed=chosen.seed,
+        blur=chosen.blur,
+        mannequin=not chosen.no_mannequin,
+        net=not chosen.no_net,
+    )
+    print(f"{len(strands)} strands, {' x '.join(map(str, made.shape))} voxels of {chosen.spacing} mm: {chosen.out}")
+    return DONE
+
+
+def _add_evaluate(commands) -> None:
+    parser = _add_command(commands, "evaluate", _evaluate, "score strands against the truth")
+    parser.add_argument("truth", type=Path, help="the true strands")
+    parser.add_argument("result", type=Path, help="the strands to score, in the same frame")
+    parser.add_argument("--head", type=Path, metavar="MESH", help="OBJ of the head, for roots and points inside")
+    parser.add_argument(
+        "--voxel", type=float, nargs="+", default=[0.5, 1.0], metavar="MM", help="voxel sizes of the voxel scores"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the scores as JSON")
+
+
+def _evaluate(chosen: argparse.Namespace) -> int:
+    from .evaluation import evaluate, format_scores
+    from .head import load_obj
+    from .strand_files import read_strands
+
+    head = load_obj(chosen.head) if chosen.head else None
+    scores = evaluate(read_strands(chosen.truth), read_strands(chosen.result), head, voxels=tuple(chosen.voxel))
+    if chosen.json:
+        chosen.json.write_text(json.dumps(scores, indent=2))
+    print(format_scores(scores))
+    return DONE
+
+
+def _add_convert(commands) -> None:
+    parser = _add_command(commands, "convert", _convert, "turn strands from one file format into another")
+    parser.add_argument("source", type=Path, help="strands: .npz .bin .data .hair")
+    parser.add_argument("target", type=Path, help="the file to write; its ending says the format")
+    parser.add_argument("--points", type=int, metavar="N", help="resample each strand to N points")
+    parser.add_argument("--scale", type=float, default=1.0, help="multiply coordinates, 0.001 from mm to m, say")
+
+
+def _convert(chosen: argparse.Namespace) -> int:
+    import numpy as np
+
+    from .strand_files import read_strands, write_strands
+    from .strands import Strands
+
+    strands = read_strands(chosen.source)
+    if chosen.points:
+        if chosen.points < 2:
+            raise CT2HairError(f"--points {chosen.points}: a strand needs at least 2 points")
+        strands = Strands.from_array(strands.resampled(chosen.points), **strands.strand_attributes)
+    if chosen.scale != 1.0:
+        strands = strands.with_points(strands.points * np.float32(chosen.scale))
+    write_strands(strands, chosen.target)
+    print(f"{len(strands)} strands, {len(strands.points)} points: {chosen.target}")
+    return DONE

@@ -1,0 +1,166 @@
+"""Who wears the hair: the roots on a scalp, its landmarks, its distance field with shoulders, and the wisps of the roots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...head import Head, HeadMesh
+from ...strands import Strands
+from ..distance_field import DistanceField
+
+FIELD_STEP = 1.5
+"""Lattice (mm) of the distance field."""
+
+ROOM = 60.0
+"""How far (mm) the distance field reaches beyond the head; farther off, its outer cells go on."""
+
+LONGEST = 340.0
+"""The field reaches this far (mm) below the top of the scalp, shoulders included."""
+
+SHOULDERS = (-0.62, 0.62, 0.78)
+"""Half width and radius of the shoulders, and their depth under the scalp's lowest point, in heights of the scalp."""
+
+
+@dataclass(frozen=True)
+class Person:
+    """Roots (N, 3) with normals (N, 3) and scalp texture coordinates, the head's landmarks and its distance field.
+
+    unit: size of the head against the built-in one (1). Heights (z) and places are in the head frame, mm: middle (3,) of the
+    scalp's box, top, nape (its lowest), brow, chin, front and back (y), side (half width).
+    """
+
+    roots: np.ndarray
+    normals: np.ndarray
+    root_uv: np.ndarray
+    field: DistanceField
+    unit: float
+    middle: np.ndarray
+    side: float
+    top: float
+    nape: float
+    front: float
+    back: float
+    hairline: float
+
+    @property
+    def brow(self) -> float:
+        return self.hairline - 50.0 * self.unit
+
+    @property
+    def chin(self) -> float:
+        return self.nape - 48.0 * self.unit
+
+    @property
+    def height(self) -> np.ndarray:
+        """(N,) 0 at the nape to 1 at the top."""
+        return np.clip((self.roots[:, 2] - self.nape) / (self.top - self.nape), 0.0, 1.0)
+
+    @property
+    def forward(self) -> np.ndarray:
+        """(N,) 0 at the back of the scalp to 1 at its front."""
+        return np.clip((self.back - self.roots[:, 1]) / (self.back - self.front), 0.0, 1.0)
+
+    @property
+    def crown(self) -> np.ndarray:
+        """(3,): where the whorl is: behind the top."""
+        return np.array([self.middle[0], self.middle[1] + 30.0 * self.unit, self.top - 6.0 * self.unit])
+
+    def along_scalp(self, vectors: np.ndarray) -> np.ndarray:
+        """(N, 3) unit: vectors (N, 3) laid into the tangent planes at the roots."""
+        flat = vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals
+        return unit_rows(flat)
+
+    def outward(self) -> np.ndarray:
+        """(N, 3) unit, horizontal: away from the head's axis."""
+        away = self.roots - self.middle
+        away[:, 2] = 0.0
+        return unit_rows(away)
+
+
+def unit_rows(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+def person(mesh: HeadMesh, strands: int, seed: int) -> Person:
+    """Roots spread over a head's scalp (head frame), with everything that styles ask about it."""
+    head = Head(mesh)
+    on = head.sample_scalp(strands, seed)
+    scalp = head.mesh.vertices[head.mesh.scalp].astype(np.float64)
+    low, high = scalp.min(axis=0), scalp.max(axis=0)
+    middle = 0.5 * (low + high)
+    unit = 0.5 * (high[0] - low[0]) / 76.0
+    central = np.abs(scalp[:, 0] - middle[0]) < 8.0 * unit
+    at_front = central & (scalp[:, 1] < middle[1])
+    hairline = scalp[at_front, 2].min() if at_front.any() else low[2] + 0.8 * (high[2] - low[2])
+    lowest = np.minimum(low - ROOM, [low[0] - ROOM, low[1] - ROOM, high[2] - LONGEST * unit])
+    field = DistanceField.around(head, lowest, high + ROOM, FIELD_STEP * unit)
+    return Person(
+        on.position.astype(np.float64),
+        on.normal.astype(np.float64),
+        on.uv,
+        _with_shoulders(field, middle, low[2], unit),
+        float(unit),
+        middle,
+        float(0.5 * (high[0] - low[0])),
+        float(high[2]),
+        float(low[2]),
+        float(low[1]),
+        float(high[1]),
+        float(hairline),
+    )
+
+
+def _with_shoulders(field: DistanceField, middle: np.ndarray, nape: float, unit: float) -> DistanceField:
+    """The field with shoulders below the neck, so that long hair has something to fall on."""
+    axes = [field.origin[a] + field.step * np.arange(field.values.shape[a]) for a in range(3)]
+    x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
+    # a level capsule, drooping outwards
+    across = np.abs(x - middle[0])
+    drop = nape - 160.0 * unit - 0.25 * np.maximum(across - 50.0 * unit, 0.0)
+    beyond = np.maximum(across - 150.0 * unit, 0.0)
+    away = np.sqrt(beyond**2 + (0.9 * (y - middle[1] - 10.0 * unit)) ** 2 + (z - drop) ** 2) - 50.0 * unit
+    return DistanceField(np.minimum(field.values, away.astype(np.float32)), field.step, field.origin)
+
+
+@dataclass(frozen=True)
+class Wisps:
+    """Roots in groups. group: (N,) int64 number of each root's wisp; lead: (N,) int64 the root that leads it; count."""
+
+    group: np.ndarray
+    lead: np.ndarray
+    count: int
+
+    def shared(self, generator: np.random.Generator, *shape: int) -> np.ndarray:
+        """(N, *shape) standard normal numbers, the same for all of a wisp."""
+        return generator.normal(size=(self.count, *shape))[self.group]
+
+    def uniform(self, generator: np.random.Generator, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+        """(N,) uniform numbers, the same for all of a wisp."""
+        return generator.uniform(low, high, self.count)[self.group]
+
+
+def wisps(
+    who: Person, count: int, generator: np.random.Generator, side: np.ndarray | None = None, ragged: float = 3.0
+) -> Wisps:
+    """`count` wisps round as many evenly spread roots; `side` (N,) keeps those of different sides (of a parting) apart.
+
+    ragged: mm by which the wisps' borders fray.
+    """
+    count = min(count, len(who.roots))
+    # any first part of the roots is spread over the whole scalp
+    places = who.roots + generator.normal(size=who.roots.shape) * ragged * who.unit
+    places[:count] = who.roots[:count]
+    if side is not None:
+        places = np.column_stack([places, 1000.0 * side])
+    _, group = cKDTree(places[:count]).query(places)
+    return Wisps(group.astype(np.int64), group.astype(np.int64), count)
+
+
+def strands_of(who: Person, courses: np.ndarray) -> Strands:
+    """Strands from courses (N, P, 3), rooted exactly, with `root_uv`."""
+    courses = courses.astype(np.float32)
+    courses[:, 0] = who.roots
+    return Strands.from_array(courses, root_uv=who.root_uv.astype(np.float32))

@@ -1,0 +1,108 @@
+"""Which segments touch the scalp (Algorithm 1), and which end of every other one is its root (paper 3.2.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
+
+from ..head import Head
+from ..settings import GuideSettings
+from ..strands import Strands
+
+TANGENT_SPAN = 3.0
+"""mm; the length at an end over which its direction is taken: a voxel or two would be noise."""
+TOUCH = 3.0
+"""mm; an end this close over the cleared net is a root whatever the segment's length (short hair has none of tau_l)."""
+VOTE_STEP = 2.0
+"""mm between the points that vote on directions."""
+VOTERS = 8
+"""Neighbouring points each of them listens to."""
+ROUNDS = 200
+"""Sweeps of the signs at most; they settle in a few dozen."""
+SCALP_HINT = 0.02
+"""How much the nearness of an end to the scalp says by itself, against neighbours that say about 1."""
+
+
+def end_tangents(strands: Strands, span: float = TANGENT_SPAN) -> tuple[np.ndarray, np.ndarray]:
+    """((N, 3), (N, 3)) unit directions from each strand's first point into it, and from its last point back into it."""
+    arc = strands.arc_lengths()
+    first, last = strands.offsets[:-1], strands.offsets[1:] - 1
+    index = strands.strand_index
+    near_first = np.minimum(first + np.bincount(index[arc <= span], minlength=len(strands)), last)
+    total = arc[last]
+    near_last = np.maximum(last - np.bincount(index[total[index] - arc <= span], minlength=len(strands)), first)
+    out = []
+    for at, to in ((first, near_first), (last, near_last)):
+        vector = (strands.points[to] - strands.points[at]).astype(np.float64)
+        out.append(vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9))
+    return out[0], out[1]
+
+
+def fine_ends(strands: Strands, head: Head, settings: GuideSettings) -> np.ndarray:
+    """(N,) int8: 1 where the first point is a root on the scalp, -1 where the last one is, 0 for poor segments (Algorithm 1).
+
+    A root end lies within `scalp_reach` of the scalp and leaves it within `scalp_angle` of its normal; the segment is at least
+    `fine_length` long or the end within 3 mm. Where both ends are, the one that is closer and steeper wins.
+    """
+    forward, backward = end_tangents(strands)
+    long = strands.lengths() >= settings.fine_length
+    merit = np.full((2, len(strands)), -np.inf)
+    for n, (ends, inward) in enumerate(((strands.roots, forward), (strands.tips, backward))):
+        scalp = head.closest_scalp(ends)
+        steep = (scalp.normal * inward).sum(axis=1)
+        reached = (scalp.distance <= settings.scalp_reach) & (steep >= np.cos(np.radians(settings.scalp_angle)))
+        reached &= long | (scalp.distance <= TOUCH)
+        merit[n] = np.where(reached, steep - scalp.distance / settings.scalp_reach, -np.inf)
+    sign = np.where(merit[0] >= merit[1], 1, -1)
+    return np.where(np.isfinite(merit.max(axis=0)), sign, 0).astype(np.int8)
+
+
+def signs(strands: Strands, fine: np.ndarray, head: Head, settings: GuideSettings) -> np.ndarray:
+    """(N,) float64 in [-1, 1]: above 0 where a strand runs root to tip as it is, below where it must be turned, magnitude
+    for certainty.
+
+    Fine strands are sure. The others take the sign that agrees best with their neighbours along the hair: the mean-field
+    solution of a signed graph of strands, an edge the summed agreement of their neighbouring points' tangents.
+    """
+    samples = strands.resampled_by_step(VOTE_STEP)
+    index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
+    tree = cKDTree(samples.points)
+    reach = settings.neighbour_radius
+    rows, columns, weights = [], [], []
+    size = 65536
+    for start in range(0, len(samples.points), size):
+        part = slice(start, start + size)
+        distance, near = tree.query(samples.points[part], k=VOTERS + 1, distance_upper_bound=reach, workers=-1)
+        found = np.isfinite(distance)
+        near = np.where(found, near, 0)
+        agreement = np.einsum("nkc,nc->nk", tangents[near], tangents[part])
+        weight = (
+            np.sign(agreement) * np.abs(agreement) ** 4 * np.exp(-0.5 * (np.where(found, distance, 0.0) / (0.5 * reach)) ** 2)
+        )
+        used = found & (index[near] != index[part][:, None])
+        rows.append(np.broadcast_to(index[part][:, None], near.shape)[used])
+        columns.append(index[near][used])
+        weights.append(weight[used])
+    count = len(strands)
+    graph = coo_matrix(
+        (
+            np.concatenate(weights or [[]]),
+            (np.concatenate(rows or [[]]).astype(int), np.concatenate(columns or [[]]).astype(int)),
+        ),
+        shape=(count, count),
+    ).tocsr()
+    graph = graph + graph.T
+    scale = np.asarray(abs(graph).sum(axis=1)).ravel()
+    near_root = head.closest_scalp(strands.roots).distance.astype(np.float64)
+    near_tip = head.closest_scalp(strands.tips).distance.astype(np.float64)
+    hint = SCALP_HINT * np.clip((near_tip - near_root) / np.maximum(strands.lengths(), 1.0), -1.0, 1.0)
+    sure = fine != 0
+    value = np.where(sure, fine, 0.0).astype(np.float64)
+    for _ in range(ROUNDS):
+        heard = np.where(sure, fine, np.tanh(3.0 * (graph @ value / np.maximum(scale, 1e-9) + hint)))
+        change = np.abs(heard - value).max(initial=0.0)
+        value = 0.5 * (value + heard)
+        if change < 1e-3:
+            break
+    return value

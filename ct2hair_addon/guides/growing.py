@@ -1,0 +1,162 @@
+"""Poor segments grown along rooted neighbours, and every strand's root curved into the scalp (paper 3.2.2, supplement 2)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..head import Head
+from ..settings import GuideSettings
+from ..strands import Strands, offsets_from_counts
+from .direction import end_tangents
+
+REACHES = (1.0, 2.0, 4.0)
+"""Multiples of the neighbour radius that are tried in turn: the nearest hair first, thin places last."""
+MOST_ROUNDS = 12
+"""Rounds at one reach at most: each one roots the neighbours of the last one's."""
+CANDIDATES = 12
+"""Neighbouring points that are weighed for the one to grow along."""
+ROOT_STEP = 0.5
+"""mm between the points that lead into the scalp."""
+CLEARANCE = 0.05
+"""mm; points inside the head are pushed this far out of it."""
+
+
+def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) -> tuple[Strands, np.ndarray, np.ndarray]:
+    """Grow directed strands that are not `rooted` (N,) back along the nearest rooted one, by its own steps (supplement 2,
+    Algorithm 1).
+
+    Rooted means that the first point is within reach of the scalp. Done in rounds, so that hair far from any fine strand is
+    reached over what was grown before. Returns (strands with the grown points put before them, (N,) bool reached,
+    (N,) float32 mm grown).
+    """
+    count = len(strands)
+    reached = np.asarray(rooted, bool).copy()
+    parts: list[np.ndarray | None] = [None] * count
+    grown = np.zeros(count, np.float32)
+    forward, _ = end_tangents(strands)
+    forest: list[tuple[cKDTree, Strands, np.ndarray]] = []
+    fresh = np.flatnonzero(reached)
+    current = strands.select(fresh)
+    for reach in REACHES:
+        for _ in range(MOST_ROUNDS):
+            if len(fresh):
+                forest.append((cKDTree(current.points), current, current.tangents()))
+            waiting = np.flatnonzero(~reached)
+            if not len(waiting) or not forest:
+                break
+            source, place, found = _guides_for(
+                strands.roots[waiting], forward[waiting], forest, reach * settings.neighbour_radius
+            )
+            chosen = np.flatnonzero(found)
+            if not len(chosen):
+                fresh = waiting[:0]
+                break
+            fresh = waiting[chosen]
+            bodies = []
+            for slot, n in zip(chosen, fresh, strict=True):
+                guide = forest[source[slot]][1]
+                strand = np.searchsorted(guide.offsets, place[slot], side="right") - 1
+                path = guide.points[guide.offsets[strand] : place[slot]]
+                shift = strands.points[strands.offsets[n]] - guide.points[place[slot]]
+                parts[n] = path + shift
+                body = np.concatenate([parts[n], strands.points[strands.offsets[n] : strands.offsets[n + 1]]])
+                grown[n] = np.linalg.norm(np.diff(body[: len(path) + 1], axis=0), axis=1).sum()
+                bodies.append(body)
+            reached[fresh] = True
+            current = Strands.from_polylines(bodies)
+    pieces = []
+    for n in range(count):
+        own = strands.points[strands.offsets[n] : strands.offsets[n + 1]]
+        pieces.append(own if parts[n] is None else np.concatenate([parts[n], own]))
+    out = Strands.from_polylines(pieces) if count else strands
+    return out.with_attributes(**strands.strand_attributes), reached, grown
+
+
+def _guides_for(ends, tangents, forest, reach):
+    """The tree, the point in it and whether there is one, for each end (M, 3): near and of one direction."""
+    source, place = np.zeros(len(ends), np.int64), np.zeros(len(ends), np.int64)
+    best = np.full(len(ends), np.inf)
+    for number, (tree, _, directions) in enumerate(forest):
+        distance, near = tree.query(ends, k=CANDIDATES, distance_upper_bound=reach, workers=-1)
+        found = np.isfinite(distance)
+        near = np.where(found, near, 0)
+        agreement = np.einsum("nkc,nc->nk", directions[near], tangents)
+        # A neighbour of another direction is as bad as one at the edge of reach; later rounds' are worse than earlier ones'.
+        cost = np.where(found & (agreement > 0.5), distance / reach + 2.0 * (1.0 - agreement) + 0.05 * number, np.inf)
+        column = cost.argmin(axis=1)
+        rows = np.arange(len(ends))
+        better = cost[rows, column] < best
+        best = np.where(better, cost[rows, column], best)
+        source = np.where(better, number, source)
+        place = np.where(better, near[rows, column], place)
+    return source, place, np.isfinite(best)
+
+
+def lead_into_scalp(strands: Strands, head: Head) -> tuple[Strands, np.ndarray]:
+    """Put a curve before each strand that runs from the scalp into its first point's direction; returns (strands, (N,) mm
+    added).
+
+    The root lies where the hair, followed straight back, would come closest to the scalp; the curve is a cubic Hermite piece
+    that
+    leaves the scalp leaning to its normal. A first point already on the scalp or in the head is moved there.
+    """
+    if not len(strands):
+        return strands, np.zeros(0, np.float32)
+    forward, _ = end_tangents(strands)
+    ends = strands.roots.astype(np.float64)
+    near = head.closest_scalp(ends)
+    depth = np.maximum(head.signed_distance(ends), 0.0).astype(np.float64)
+    steep = np.clip((near.normal * forward).sum(axis=1), 0.35, 1.0)
+    root = head.closest_scalp(ends - forward * (depth / steep)[:, None])
+    gap = np.linalg.norm(root.position - ends, axis=1)
+    leaving = forward + 0.7 * root.normal
+    leaving /= np.maximum(np.linalg.norm(leaving, axis=1, keepdims=True), 1e-9)
+    counts = np.maximum(np.ceil(gap / ROOT_STEP).astype(np.int64), 1)
+    offsets = offsets_from_counts(counts)
+    index = np.repeat(np.arange(len(strands)), counts)
+    t = ((np.arange(offsets[-1]) - offsets[:-1][index]) / counts[index])[:, None]
+    start, end, pull = root.position.astype(np.float64)[index], ends[index], gap[index][:, None]
+    curve = (2 * t**3 - 3 * t**2 + 1) * start + (t**3 - 2 * t**2 + t) * pull * leaving[index]
+    curve += (3 * t**2 - 2 * t**3) * end + (t**3 - t**2) * pull * forward[index]
+    joined = _joined(curve.astype(np.float32), offsets, strands.points, strands.offsets)
+    lead = Strands(joined, offsets_from_counts(counts + strands.counts), strands.strand_attributes)
+    return lead, gap.astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _joined(before, before_offsets, after, after_offsets):
+    out = np.empty((len(before) + len(after), 3), np.float32)
+    at = 0
+    for n in range(len(after_offsets) - 1):
+        for m in range(before_offsets[n], before_offsets[n + 1]):
+            out[at] = before[m]
+            at += 1
+        for m in range(after_offsets[n], after_offsets[n + 1]):
+            out[at] = after[m]
+            at += 1
+    return out
+
+
+def push_out(strands: Strands, head: Head) -> tuple[Strands, int]:
+    """Strands with every point but the first outside the head: those inside go straight out through the nearest surface."""
+    points = strands.points.astype(np.float64)
+    first = np.zeros(len(points), bool)
+    first[strands.offsets[:-1]] = True
+    depth = head.signed_distance(points)
+    moved = np.flatnonzero((depth < CLEARANCE) & ~first)
+    total = len(moved)
+    step = 0.25
+    for _ in range(4):
+        if not len(moved):
+            break
+        at = points[moved]
+        slope = np.stack(
+            [head.signed_distance(at + step * axis) - head.signed_distance(at - step * axis) for axis in np.eye(3)], axis=1
+        ).astype(np.float64)
+        slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+        points[moved] = at + slope * (CLEARANCE * 1.5 - depth[moved])[:, None]
+        depth[moved] = head.signed_distance(points[moved])
+        moved = moved[depth[moved] < CLEARANCE]
+    return strands.with_points(points.astype(np.float32)), total

@@ -1,0 +1,94 @@
+"""Trilinear reads of the density inside kernels, with a fast path for points whose eight voxels share a brick."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from ..volume.grid import trilinear
+
+
+@numba.njit(cache=True, nogil=True)
+def density_at(table, bricks, x, y, z):
+    """The trilinear density at continuous voxel indices, 0 off the bricks: `volume.grid.trilinear`, several times faster."""
+    if x < 0.0 or y < 0.0 or z < 0.0:
+        return 0.0
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = i & 15, j & 15, k & 15
+    if a == 15 or b == 15 or c == 15:
+        return trilinear(table, bricks, np.float32(0.0), x, y, z)
+    I, J, K = i >> 4, j >> 4, k >> 4
+    if I >= table.shape[0] or J >= table.shape[1] or K >= table.shape[2]:
+        return 0.0
+    row = table[I, J, K]
+    if row < 0:
+        return 0.0
+    u, v, w = x - i, y - j, z - k
+    brick = bricks[row]
+    low = (brick[a, b, c] * (1.0 - w) + brick[a, b, c + 1] * w) * (1.0 - v)
+    low += (brick[a, b + 1, c] * (1.0 - w) + brick[a, b + 1, c + 1] * w) * v
+    high = (brick[a + 1, b, c] * (1.0 - w) + brick[a + 1, b, c + 1] * w) * (1.0 - v)
+    high += (brick[a + 1, b + 1, c] * (1.0 - w) + brick[a + 1, b + 1, c + 1] * w) * v
+    return low * (1.0 - u) + high * u
+
+
+@numba.njit(cache=True, nogil=True)
+def line_mean(table, bricks, x, y, z, dx, dy, dz, reach):
+    """The mean density at the 2 reach + 1 points a voxel apart on the line through (x, y, z)."""
+    total = 0.0
+    for k in range(-reach, reach + 1):
+        total += density_at(table, bricks, x + k * dx, y + k * dy, z + k * dz)
+    return total / (2 * reach + 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def plane(dx, dy, dz):
+    """Two unit vectors that span the plane normal to the unit vector d, as six numbers (u, v)."""
+    if abs(dx) <= abs(dy) and abs(dx) <= abs(dz):
+        ux, uy, uz = 0.0, dz, -dy
+    elif abs(dy) <= abs(dz):
+        ux, uy, uz = -dz, 0.0, dx
+    else:
+        ux, uy, uz = dy, -dx, 0.0
+    norm = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux * norm, uy * norm, uz * norm
+    return ux, uy, uz, dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux
+
+
+@numba.njit(cache=True, nogil=True)
+def centred(table, bricks, x, y, z, dx, dy, dz, reach, most):
+    """(x, y, z, value): the point moved to the peak of the density in the plane normal to d, by at most `most` voxels.
+
+    The density is averaged over 2 reach + 1 points along d; the peak is that of a least-squares paraboloid
+    through a 3 x 3 grid, or the grid's best point where the paraboloid has no peak nearby.
+    """
+    ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
+    grid = 0.8
+    sum_u = sum_v = sum_uu = sum_vv = sum_uv = total = 0.0
+    best, at_u, at_v, middle = -1e30, 0.0, 0.0, 0.0
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            px, py, pz = x + grid * (a * ux + b * vx), y + grid * (a * uy + b * vy), z + grid * (a * uz + b * vz)
+            value = line_mean(table, bricks, px, py, pz, dx, dy, dz, reach)
+            total += value
+            sum_u += a * value
+            sum_v += b * value
+            sum_uu += a * a * value
+            sum_vv += b * b * value
+            sum_uv += a * b * value
+            if a == 0 and b == 0:
+                middle = value
+            if value > best:
+                best, at_u, at_v = value, float(a), float(b)
+    # Least squares of c + gu a + gv b + (huu a^2 + hvv b^2) / 2 + huv a b on the grid.
+    gu, gv, huv = sum_u / 6.0, sum_v / 6.0, sum_uv / 4.0
+    huu, hvv = sum_uu - 2.0 / 3.0 * total, sum_vv - 2.0 / 3.0 * total
+    det = huu * hvv - huv * huv
+    if huu < 0.0 and hvv < 0.0 and det > 0.0:
+        su, sv = -(hvv * gu - huv * gv) / det, -(huu * gv - huv * gu) / det
+        if su * su + sv * sv <= 2.0:
+            at_u, at_v = su, sv
+    length = grid * np.sqrt(at_u * at_u + at_v * at_v)
+    scale = grid * (1.0 if length <= most else most / length)
+    at_u, at_v = at_u * scale, at_v * scale
+    return x + at_u * ux + at_v * vx, y + at_u * uy + at_v * vy, z + at_u * uz + at_v * vz, middle

@@ -1,0 +1,119 @@
+"""Stage 4: guide strands from the density, rooted on the scalp, root first (paper 3.2.2, supplement 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..head import Head
+from ..orientation import OrientationField
+from ..progress import Progress, part, silent
+from ..settings import GuideSettings
+from ..strands import Strands
+from ..volume.grid import BrickVolume
+from .direction import fine_ends, signs
+from .growing import grow_to_root, lead_into_scalp, push_out
+from .profile import StrandProfile, strand_profile
+from .seeds import seed_order, seed_voxels
+from .trace import trace_segments
+
+PROFILED = 8000
+"""Candidates that the strand's profile is measured on."""
+COARSEST = 1.0
+"""mm; points of a guide are at most this far apart, or two voxels where that is less."""
+
+
+@dataclass(frozen=True)
+class Guides:
+    """Guide strands: scan frame, mm, root first and on the scalp.
+
+    strands: with `support` (N,) float32, the share of the length that was traced in the scan and not grown, and
+    `root_uv` (N, 2) float32. profile: what a lone strand looks like in this scan. tally: what was kept and dropped, and why.
+    """
+
+    strands: Strands
+    profile: StrandProfile
+    tally: dict[str, int]
+
+
+def find_segments(
+    density: BrickVolume,
+    hair_level: float,
+    field: OrientationField,
+    settings: GuideSettings,
+    seed: int,
+    progress: Progress = silent,
+) -> tuple[Strands, StrandProfile, dict[str, int]]:
+    """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing."""
+    voxels, directions, shuffle = seed_voxels(field.confidence, field.direction, seed)
+    chosen = np.argsort(shuffle, kind="stable")[:PROFILED]
+    axes = directions[chosen].astype(np.float64)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    profile = strand_profile(density, hair_level, voxels[chosen], axes)
+    order = seed_order(density, voxels, directions, shuffle, profile, part(progress, 0.0, 0.15))
+    residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
+    found = trace_segments(residual, voxels, directions, order, profile, settings, part(progress, 0.15, 1.0))
+    return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
+
+
+def trace_guides(
+    density: BrickVolume,
+    hair_level: float,
+    field: OrientationField,
+    head: Head,
+    settings: GuideSettings | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Guides:
+    """Guide strands of the hair in `density` (air at 0, hair above `hair_level`) on `head`.
+
+    Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, the poor ones
+    grown along rooted
+    neighbours, each root led into the scalp, no point left inside the head. The same seed gives the same strands, on any
+    number of threads.
+    """
+    settings = settings or GuideSettings()
+    segments, profile, tally = find_segments(density, hair_level, field, settings, seed, part(progress, 0.0, 0.85))
+    strands, more = root_segments(segments, density.spacing, head, settings, part(progress, 0.85, 1.0))
+    progress(1, 1)
+    return Guides(strands, profile, tally | more)
+
+
+def root_segments(
+    segments: Strands, spacing: float, head: Head, settings: GuideSettings, progress: Progress = silent
+) -> tuple[Strands, dict[str, int]]:
+    """Directed and rooted strands from undirected segments (mm): Algorithm 1, growing, roots; and what became of them."""
+    tally: dict[str, int] = {}
+    traced = segments.lengths()
+    fine = fine_ends(segments, head, settings)
+    progress(0.1, 1.0)
+    value = signs(segments, fine, head, settings)
+    progress(0.4, 1.0)
+    directed = segments.reversed(value < 0)
+    tally["fine segments"] = int((fine != 0).sum())
+    tally["poor segments"] = int((fine == 0).sum())
+    tally["poor segments without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
+    bodies, reached, grown = grow_to_root(directed.resampled_by_step(_step(spacing)), fine != 0, settings)
+    progress(0.7, 1.0)
+    tally["dropped: no rooted hair near"] = int((~reached).sum())
+    backed = traced / np.maximum(traced + grown, 1e-6)
+    enough = reached & (backed >= settings.min_support)
+    tally["dropped: mostly grown"] = int((reached & ~enough).sum())
+    kept, backed_length = bodies.select(enough), traced[enough]
+    rooted, _ = lead_into_scalp(kept, head)
+    progress(0.85, 1.0)
+    rooted, pushed = push_out(rooted, head)
+    rooted = rooted.resampled_by_step(_step(spacing))
+    rooted, again = push_out(rooted, head)
+    tally["points pushed out of the head"] = pushed + again
+    tally["guides"] = len(rooted)
+    root = head.closest_scalp(rooted.roots) if len(rooted) else None
+    support = np.clip(backed_length / np.maximum(rooted.lengths(), 1e-6), 0.0, 1.0).astype(np.float32)
+    uv = root.uv.astype(np.float32) if root is not None else np.zeros((0, 2), np.float32)
+    progress(1.0, 1.0)
+    return Strands(rooted.points, rooted.offsets, {"support": support, "root_uv": uv}), tally
+
+
+def _step(spacing: float) -> float:
+    return max(min(COARSEST, 2.0 * spacing), spacing)

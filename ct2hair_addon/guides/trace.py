@@ -1,0 +1,382 @@
+"""Following strands through the density and taking each found one out, so that its neighbour shows.
+
+In place of the paper's mean shift and Euler steps (3.2.2): segments come straight from the density. A batch of seeds is
+followed in parallel through the
+same residual; then, in the batch's order, each path is held against what the earlier ones have left, and what stands is
+subtracted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numba
+import numpy as np
+
+from ..progress import Progress, silent
+from ..settings import GuideSettings
+from ..volume.grid import BrickVolume
+from .profile import StrandProfile
+from .sampling import centred, density_at, line_mean, plane
+
+MOST_STEPS = 3000
+"""Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
+BATCH = 1024
+"""Seeds followed at once: few enough that two of them seldom meet the same strand, many enough for any number of threads."""
+LOOK = 10
+"""voxel; how far ahead the density is summed."""
+RINGS = ((0.12, 6), (0.26, 8), (0.45, 10))
+"""Directions tried around the present one: (tangent of the angle, how many)."""
+TURN_COST = 0.8
+"""Share of a strand's density that a turn by one radian in one step must win to be taken."""
+SUPPORT = 0.4
+"""Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
+SHARPNESS = 0.06
+"""Share of a strand's density by which one direction must beat another to count e times as much."""
+
+
+class End(IntEnum):
+    """Why a path ended."""
+
+    FAINT = 0
+    TURN = 1
+    LONG = 2
+    LOOP = 3
+    TAKEN = 4
+
+
+END_NAMES = {
+    End.FAINT: "ended: density too low ahead",
+    End.TURN: "ended: turn too sharp",
+    End.LONG: "ended: longest path",
+    End.LOOP: "ended: ran in a circle",
+    End.TAKEN: "ended: met a strand already found",
+}
+
+
+def _fan() -> np.ndarray:
+    """(D, 2): offsets in the normal plane of the directions tried, the straight one first."""
+    fan = [(0.0, 0.0)]
+    for n, (tangent, count) in enumerate(RINGS):
+        for a in range(count):
+            angle = 2.0 * np.pi * (a + 0.5 * n) / count
+            fan.append((tangent * np.cos(angle), tangent * np.sin(angle)))
+    return np.array(fan)
+
+
+FAN = _fan()
+WEIGHTS = np.linspace(1.0, 0.4, LOOK)
+"""Weights of the look-ahead's samples: what is near says more, since hair curves."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
+    """Follow one way from (x, y, z) along d into `path` (n, 3) voxels; returns (points, reason)."""
+    whole = weights.sum()
+    count = 0
+    start_x, start_y, start_z = x, y, z
+    scores = np.empty(len(fan))
+    while True:
+        if count == len(path):
+            return count, End.LONG
+        ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
+        best, chosen, backed = -1e30, 0, 0.0
+        for n in range(len(fan)):
+            a, b = fan[n, 0], fan[n, 1]
+            ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
+            square = 1.0 + a * a + b * b
+            norm = 1.0 / np.sqrt(square)
+            ex, ey, ez = ex * norm, ey * norm, ez * norm
+            total = 0.0
+            for k in range(len(weights)):
+                value = density_at(table, bricks, x + (k + 1) * ex, y + (k + 1) * ey, z + (k + 1) * ez) / seen
+                total += weights[k] * min(value, 1.3)
+            total /= whole
+            scores[n] = total - TURN_COST * (square - 1.0)
+            if scores[n] > best:
+                best, chosen, backed = scores[n], n, total
+        if backed < SUPPORT:
+            # The look-ahead sees the end before it is there: the last stretch, straight on.
+            for _ in range(len(weights) // 2):
+                x, y, z = x + step * dx, y + step * dy, z + step * dz
+                value = density_at(table, bricks, x, y, z) + density_at(table, bricks, x + dx, y + dy, z + dz)
+                if value < seen or count == len(path):
+                    break
+                path[count, 0], path[count, 1], path[count, 2] = x, y, z
+                count += 1
+            return count, End.FAINT
+        a = b = weight = 0.0
+        for n in range(len(fan)):
+            if (
+                scores[n] > best - 4.0 * SHARPNESS
+                and (fan[n, 0] - fan[chosen, 0]) ** 2 + (fan[n, 1] - fan[chosen, 1]) ** 2 < 0.12
+            ):
+                w = np.exp((scores[n] - best) / SHARPNESS)
+                a, b, weight = a + w * fan[n, 0], b + w * fan[n, 1], weight + w
+        a, b = a / weight, b / weight
+        ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
+        norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
+        ex, ey, ez = ex * norm, ey * norm, ez * norm
+        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, 0.3 * step)
+        # Inertia: the new direction leans on the last few steps' secant.
+        if count >= 4:
+            sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]
+        else:
+            sx, sy, sz = qx - start_x, qy - start_y, qz - start_z
+        norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
+        ex, ey, ez = 0.7 * ex + 0.3 * sx * norm, 0.7 * ey + 0.3 * sy * norm, 0.7 * ez + 0.3 * sz * norm
+        norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
+        ex, ey, ez = ex * norm, ey * norm, ez * norm
+        if ex * dx + ey * dy + ez * dz < turn:
+            return count, End.TURN
+        x, y, z, dx, dy, dz = qx, qy, qz, ex, ey, ez
+        path[count, 0], path[count, 1], path[count, 2] = x, y, z
+        count += 1
+        if count > 30 and (x - start_x) ** 2 + (y - start_y) ** 2 + (z - start_z) ** 2 < 1.0:
+            return count, End.LOOP
+
+
+@numba.njit(cache=True, nogil=True)
+def smoothed(path, widths, most):
+    """The path under a local quadratic: at each point the widest of the windows (half-widths, rising) whose fit stays within
+    `most`
+    (root mean square, in the path's unit) of the points. Long windows for smooth hair, short ones for curls."""
+    size = len(path)
+    out = path.copy()
+    for n in range(size):
+        for w in range(len(widths)):
+            half = min(widths[w], n, size - 1 - n)
+            full = widths[w]
+            # Windows slide inwards at the ends, so that the ends are smoothed as well.
+            first, last = n - half, n + half
+            if half < full:
+                first, last = max(n - full, 0), min(n + full, size - 1)
+            if last - first < 4:
+                continue
+            s0 = s1 = s2 = s3 = s4 = 0.0
+            for m in range(first, last + 1):
+                t = float(m - n)
+                s0 += 1.0
+                s1 += t
+                s2 += t * t
+                s3 += t * t * t
+                s4 += t * t * t * t
+            # Cofactors of the first row of the normal matrix: the fit's value at n is a combination of the moments.
+            c0, c1, c2 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
+            det = s0 * c0 + s1 * c1 + s2 * c2
+            k11, k12, k22 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3, s0 * s2 - s1 * s1
+            wrong = 0.0
+            values = np.empty(3)
+            for axis in range(3):
+                m0 = m1 = m2 = square = 0.0
+                for m in range(first, last + 1):
+                    t, value = float(m - n), float(path[m, axis] - path[n, axis])
+                    m0 += value
+                    m1 += t * value
+                    m2 += t * t * value
+                    square += value * value
+                f0 = (c0 * m0 + c1 * m1 + c2 * m2) / det
+                f1 = (c1 * m0 + k11 * m1 + k12 * m2) / det
+                f2 = (c2 * m0 + k12 * m1 + k22 * m2) / det
+                wrong += max(square - f0 * m0 - f1 * m1 - f2 * m2, 0.0)
+                values[axis] = f0
+            if w > 0 and wrong > most * most * s0:
+                break
+            for axis in range(3):
+                out[n, axis] = path[n, axis] + values[axis]
+    return out
+
+
+@numba.njit(cache=True, parallel=True)
+def _alive(table, bricks, voxels, directions, level):
+    alive = np.zeros(len(voxels), np.bool_)
+    for n in numba.prange(len(voxels)):
+        dx, dy, dz = float(directions[n, 0]), float(directions[n, 1]), float(directions[n, 2])
+        norm = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx * norm, dy * norm, dz * norm
+        x, y, z, _value = centred(
+            table, bricks, float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2]), dx, dy, dz, 2, 0.8
+        )
+        alive[n] = line_mean(table, bricks, x, y, z, dx, dy, dz, 4) > level
+    return alive
+
+
+@numba.njit(cache=True, parallel=True)
+def _trace(table, bricks, voxels, directions, step, turn, seen, fan, weights, widths, most, paths, firsts, counts, ends):
+    """Follow each seed both ways; `paths[n, firsts[n]:firsts[n] + counts[n, 0] + counts[n, 1] + 1]` is its smoothed path."""
+    for n in numba.prange(len(voxels)):
+        dx, dy, dz = float(directions[n, 0]), float(directions[n, 1]), float(directions[n, 2])
+        norm = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx * norm, dy * norm, dz * norm
+        x, y, z = float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2])
+        for _ in range(2):
+            x, y, z, _value = centred(table, bricks, x, y, z, dx, dy, dz, 3, 0.7)
+        middle = paths.shape[1] // 2
+        ahead, reason = _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, paths[n, middle + 1 :])
+        ends[n, 1] = reason
+        # The way back sets out along the first steps' own direction, surer than the field's.
+        if ahead >= 4:
+            sx, sy, sz = paths[n, middle + 4, 0] - x, paths[n, middle + 4, 1] - y, paths[n, middle + 4, 2] - z
+            norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
+            dx, dy, dz = sx * norm, sy * norm, sz * norm
+        back_path = np.empty((middle, 3), np.float32)
+        back, reason = _follow(table, bricks, x, y, z, -dx, -dy, -dz, step, turn, seen, fan, weights, back_path)
+        ends[n, 0] = reason
+        paths[n, middle, 0], paths[n, middle, 1], paths[n, middle, 2] = x, y, z
+        for m in range(back):
+            paths[n, middle - 1 - m] = back_path[m]
+        firsts[n] = middle - back
+        counts[n, 0], counts[n, 1] = back, ahead
+        paths[n, middle - back : middle + ahead + 1] = smoothed(paths[n, middle - back : middle + ahead + 1], widths, most)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_strand(table, bricks, path, amplitudes, blur):
+    """Add a strand's blurred profile (peak `amplitudes[n]` on the line) to the bricks: a Gaussian blob at each point, weighted
+    by its share of the length, which for points no farther apart than the blur is the tube itself to a thousandth."""
+    reach = int(np.ceil(3.2 * blur))
+    size = 2 * reach + 1
+    wx, wy, wz = np.empty(size), np.empty(size), np.empty(size)
+    shrink = -0.5 / (blur * blur)
+    for n in range(len(path)):
+        length = 0.0
+        for m in (n - 1, n):
+            if m >= 0 and m + 1 < len(path):
+                length += 0.5 * np.sqrt(
+                    (path[m + 1, 0] - path[m, 0]) ** 2 + (path[m + 1, 1] - path[m, 1]) ** 2 + (path[m + 1, 2] - path[m, 2]) ** 2
+                )
+        weight = amplitudes[n] * length / (blur * np.sqrt(2.0 * np.pi))
+        if weight == 0.0:
+            continue
+        ci, cj, ck = int(np.floor(path[n, 0] + 0.5)), int(np.floor(path[n, 1] + 0.5)), int(np.floor(path[n, 2] + 0.5))
+        for t in range(size):
+            wx[t] = weight * np.exp(shrink * (ci + t - reach - path[n, 0]) ** 2)
+            wy[t] = np.exp(shrink * (cj + t - reach - path[n, 1]) ** 2)
+            wz[t] = np.exp(shrink * (ck + t - reach - path[n, 2]) ** 2)
+        for a in range(size):
+            i = ci + a - reach
+            if i < 0 or i >> 4 >= table.shape[0]:
+                continue
+            for b in range(size):
+                j = cj + b - reach
+                if j < 0 or j >> 4 >= table.shape[1]:
+                    continue
+                across = wx[a] * wy[b]
+                for c in range(size):
+                    k = ck + c - reach
+                    if k < 0 or k >> 4 >= table.shape[2]:
+                        continue
+                    row = table[i >> 4, j >> 4, k >> 4]
+                    if row >= 0:
+                        bricks[row, i & 15, j & 15, k & 15] += across * wz[c]
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(table, bricks, paths, firsts, counts, ends, seen, peak, blur, shortest, first, last):
+    """In order: cut each path to what the residual still backs around its seed and subtract it. firsts, counts and ends are
+    updated;
+    a path that is not kept has both counts at -1."""
+    window = 4
+    for n in range(first, last):
+        middle = firsts[n] + counts[n, 0]
+        if counts[n, 0] + counts[n, 1] + 1 < shortest:
+            counts[n, 0] = counts[n, 1] = -1
+            continue
+        low, high = firsts[n], middle + counts[n, 1]
+        size = high - low + 1
+        values = np.empty(size)
+        for m in range(size):
+            p = paths[n, low + m]
+            values[m] = min(density_at(table, bricks, float(p[0]), float(p[1]), float(p[2])) / seen, 1.3)
+        backed = np.empty(size)
+        for m in range(size):
+            total, many = 0.0, 0
+            for w in range(max(m - window, 0), min(m + window, size - 1) + 1):
+                total += values[w]
+                many += 1
+            backed[m] = total / many
+        at = middle - low
+        begin, end = at, at
+        if backed[at] >= SUPPORT:
+            while begin > 0 and backed[begin - 1] >= SUPPORT:
+                begin -= 1
+            while end < size - 1 and backed[end + 1] >= SUPPORT:
+                end += 1
+        if end - begin + 1 < shortest:
+            counts[n, 0] = counts[n, 1] = -1
+            continue
+        if begin > 0:
+            ends[n, 0] = End.TAKEN
+        if end < size - 1:
+            ends[n, 1] = End.TAKEN
+        firsts[n] = low + begin
+        counts[n, 0], counts[n, 1] = at - begin, end - at
+        amplitudes = np.empty(end - begin + 1)
+        for m in range(begin, end + 1):
+            amplitudes[m - begin] = -peak * min(max(backed[m], 0.5), 1.0)
+        add_strand(table, bricks, paths[n, low + begin : low + end + 1], amplitudes, blur)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Pieces of strands as found, in voxels: points (M, 3) float32, offsets (N + 1,), without a direction yet."""
+
+    points: np.ndarray
+    offsets: np.ndarray
+    tally: dict[str, int]
+
+
+def trace_segments(
+    residual: BrickVolume,
+    voxels: np.ndarray,
+    directions: np.ndarray,
+    order: np.ndarray,
+    profile: StrandProfile,
+    settings: GuideSettings,
+    progress: Progress = silent,
+) -> Segments:
+    """Trace and subtract from the seeds in their order until none is left. `residual.bricks` is used up: pass a copy.
+
+    voxels, directions: (S, 3) seeds; order: indices into them. The result is the same on any number of threads.
+    """
+    shortest = max(int(settings.min_length / (settings.step * residual.spacing)), 6)
+    turn = np.cos(np.radians(settings.max_turn))
+    widths = np.array([4, 7, 11, 16, 24], np.int64)
+    pieces: list[np.ndarray] = []
+    tally = {"seeds": len(order), "seeds already taken": 0, "paths too short or already taken": 0}
+    tally |= dict.fromkeys(END_NAMES.values(), 0)
+    paths = np.empty((BATCH, 2 * MOST_STEPS + 1, 3), np.float32)
+    at = 0
+    progress(0, len(order))
+    while at < len(order):
+        window = order[at : at + 32 * BATCH]
+        alive = np.flatnonzero(_alive(residual.table, residual.bricks, voxels[window], directions[window], 0.55 * profile.seen))
+        if len(alive) > BATCH:
+            used, alive = int(alive[BATCH]), alive[:BATCH]
+        else:
+            used = len(window)
+        tally["seeds already taken"] += used - len(alive)
+        at += used
+        chosen = window[alive]
+        firsts = np.zeros(len(chosen), np.int64)
+        counts = np.zeros((len(chosen), 2), np.int64)
+        ends = np.zeros((len(chosen), 2), np.int64)
+        _trace(
+            residual.table, residual.bricks, voxels[chosen], directions[chosen], settings.step, turn, profile.seen, FAN,
+            WEIGHTS, widths, settings.smoothing, paths, firsts, counts, ends,
+        )  # fmt: skip
+        _settle(
+            residual.table, residual.bricks, paths, firsts, counts, ends, profile.seen, profile.peak, profile.blur, shortest, 0,
+            len(chosen),
+        )  # fmt: skip
+        for n in np.flatnonzero(counts[:, 0] >= 0):
+            pieces.append(paths[n, firsts[n] : firsts[n] + counts[n].sum() + 1].copy())
+            tally[END_NAMES[End(ends[n, 0])]] += 1
+            tally[END_NAMES[End(ends[n, 1])]] += 1
+        tally["paths too short or already taken"] += int((counts[:, 0] < 0).sum())
+        progress(at, len(order))
+    sizes = np.array([len(piece) for piece in pieces], np.int64)
+    points = np.concatenate(pieces) if pieces else np.zeros((0, 3), np.float32)
+    tally["segments"] = len(pieces)
+    return Segments(points, np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), tally)

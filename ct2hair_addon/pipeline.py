@@ -1,0 +1,373 @@
+"""The stages in order, from a scan to hair: checkpoints, resume, progress with remaining time, and the result's folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Protocol, TypeVar
+
+import numba
+import numpy as np
+
+from . import __version__
+from .checkpoints import Checkpoints, chained_key, fingerprint
+from .errors import CT2HairError
+from .evaluation import write_report
+from .guides import Guides, trace_guides
+from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
+from .interpolation import Dense, estimate_strand_count, fill_scalp
+from .measure import Meter, machine_memory
+from .orientation import OrientationField, orientation_field
+from .progress import Progress, part
+from .refinement import Refined, refine
+from .settings import Settings
+from .strands import Strands
+from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
+
+STAGES = ("scan", "head", "orientation", "guides", "dense", "refinement", "result")
+SHARES = dict(zip(STAGES, (0.15, 0.08, 0.08, 0.35, 0.08, 0.22, 0.04), strict=True))
+"""Each stage's usual share of the time, for the total progress."""
+TEXTS = {
+    "scan": "reading the scan",
+    "head": "finding the head",
+    "orientation": "estimating orientations",
+    "guides": "tracing guide strands",
+    "dense": "filling the scalp",
+    "refinement": "fitting strands to the scan",
+    "result": "writing the result",
+}
+_TYPES = (BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, Strands, Thresholds, WigScan)
+"""What checkpoints are made of."""
+DENSITY_COPIES = 4.0
+"""Peak memory of the stages over the density's bricks, as measured on scans of 10^6 to 10^8 hair voxels."""
+ENGINE_MEMORY = 1.0
+"""GB of the interpreter with numba and torch before any volume."""
+
+Value = TypeVar("Value")
+
+
+class Observer(Protocol):
+    """Whoever wants to know how it goes. `progressed` may raise `Cancelled` to stop the work."""
+
+    def started(self, stage: str, text: str) -> None: ...
+
+    def warned(self, text: str) -> None: ...
+
+    def progressed(self, stage: str, fraction: float, total: float, remaining: float | None) -> None: ...
+
+
+class Silent:
+    """The observer that looks away."""
+
+    def started(self, stage: str, text: str) -> None:
+        pass
+
+    def warned(self, text: str) -> None:
+        pass
+
+    def progressed(self, stage: str, fraction: float, total: float, remaining: float | None) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What `reconstruct` made: all in the scan frame, mm.
+
+    head_to_scan: 4 x 4, the head frame's place in the scan (rigid, with the template's scale). report: as in report.json.
+    """
+
+    hair: Strands
+    guides: Strands
+    head: HeadMesh
+    head_to_scan: np.ndarray
+    report: dict[str, Any]
+    seconds: float
+
+
+def reconstruct(
+    scan: str | os.PathLike,
+    out: str | os.PathLike,
+    settings: Settings | None = None,
+    *,
+    raw_shape: Sequence[int] | None = None,
+    raw_type: str | None = None,
+    template: HeadMesh | None = None,
+    observer: Observer | None = None,
+) -> Reconstruction:
+    """Reconstruct the hair of a scan into the folder `out`.
+
+    Writes hair.npz, guides.npz (`Strands`, mm, scan frame), head.obj, volume.vdb (the wig's density), report.json and
+    report.html, each whole or not at all. Finished stages are kept in `out/checkpoints`: the same call goes on after the
+    last one whose input and settings are unchanged.
+
+    raw_shape (x, y, z) and raw_type (a numpy type, "<u2" say) describe a raw file. template: a head mesh in the head frame
+    instead of `settings.head.mesh`. Raises CT2HairError (bad input, said in a sentence) and Cancelled (by the observer).
+    """
+    settings = settings or Settings()
+    job = _Job(Path(scan), Path(out), settings, raw_shape, raw_type, template, observer or Silent())
+    with _own_folder(job.out), _threads(settings.run.threads):
+        return job.run()
+
+
+class _Job:
+    """One run through the stages: the input, the keys of the checkpoints, and what each stage cost."""
+
+    def __init__(self, scan, out, settings, raw_shape, raw_type, template, observer) -> None:
+        self.scan: Path = scan
+        self.out: Path = out
+        self.settings: Settings = settings
+        self.raw = {"shape": raw_shape and [int(n) for n in raw_shape], "dtype": raw_type}
+        self.observer: Observer = observer
+        self.template = template or self._template()
+        self.checkpoints = Checkpoints(out / "checkpoints", _TYPES)
+        self.keys = self._keys()
+        self.costs: list[dict[str, Any]] = []
+        self.warnings: list[str] = []
+        self.begun = time.monotonic()
+        self.resumed_share = 0.0
+
+    def run(self) -> Reconstruction:
+        settings, seed = self.settings, self.settings.run.seed
+        wig = self._stage("scan", self._import)
+        self._warn(wig.warnings)
+        self._check_memory(wig.density)
+        level = wig.hair_level
+        registration = self._stage(
+            "head",
+            lambda progress: register_head(
+                self.template, wig.knots, wig.solid_points, wig.density, level, settings.head, progress=progress
+            ),
+        )
+        self._warn(registration.warnings)
+        head = Head(registration.head)
+        density, net_tally = remove_hairnet(wig.density, head, settings.head)
+        wig = dataclasses.replace(wig, density=density)  # the net's voxels are needed no more
+        guides = self._guides(density, level, head)
+
+        def fill(progress: Progress) -> Dense:
+            count = settings.interpolation.strands or estimate_strand_count(density, level, guides.strands, head)
+            return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
+
+        dense = self._stage("dense", fill)
+        refined = self._stage(
+            "refinement",
+            lambda progress: refine(dense.strands, density, level, head, settings.refinement, seed, progress=progress),
+        )
+        tallies = {
+            "scan": wig.tally,
+            "head": {**registration.tally, **net_tally},
+            "guides": guides.tally,
+            "dense": dense.tally,
+            "refinement": refined.tally,
+        }
+        return self._write(wig, registration, head, guides.strands, refined, tallies)
+
+    def _import(self, progress: Progress) -> WigScan:
+        reader = open_scan(self.scan, self.settings.scan, **self.raw)
+        thresholds = find_thresholds(reader, self.settings.scan, progress=part(progress, 0.0, 0.3))
+        wig = import_scan(reader, thresholds, self.settings.scan, progress=part(progress, 0.3, 0.95))
+        self.out.mkdir(parents=True, exist_ok=True)
+        save_vdb(wig.density, self.out / "volume.vdb")
+        return wig
+
+    def _guides(self, density: BrickVolume, level: float, head: Head) -> Guides:
+        """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
+        guides = self.checkpoints.load("guides", self.keys["guides"])
+        if guides is None:
+            field = self._stage(
+                "orientation",
+                lambda progress: orientation_field(density, level, self.settings.orientation, progress=progress),
+            )
+        guides = self._stage(
+            "guides",
+            lambda progress: trace_guides(
+                density, level, field, head, self.settings.guides, self.settings.run.seed, progress=progress
+            ),
+            guides,
+        )
+        self.checkpoints.drop("orientation")
+        if not len(guides.strands):
+            dropped = "; ".join(f"{reason}: {count}" for reason, count in guides.tally.items())
+            raise CT2HairError(
+                f"{self.scan}: no guide strand could be traced ({dropped}). Check scan.hair and the head's place, "
+                "or lower orientation.confidence"
+            )
+        return guides
+
+    def _write(self, wig: WigScan, registration: Registration, head: Head, guides: Strands, refined: Refined, tallies):
+        """Write the result's files, each whole or not at all."""
+        self.observer.started("result", TEXTS["result"])
+        progress, meter = self._progress("result"), Meter()
+        progress(0.0, 1.0)
+        hair = refined.strands
+        hair.save(self.out / "hair.npz")
+        guides.save(self.out / "guides.npz")
+        registration.head.save(self.out / "head.obj")
+        progress(0.3, 1.0)
+        lengths = hair.lengths()
+        summary = {
+            "program": {"name": "CT2Hair for Blender", "version": __version__, "python": platform.python_version()},
+            "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "memory_gb": machine_memory()},
+            "scan": {
+                "file": self.scan.name,
+                "spacing_mm": wig.density.spacing,
+                "hair_voxels": int(np.count_nonzero(wig.density.bricks > wig.hair_level)),
+                "stored_voxels": int(wig.density.bricks.size),
+                "hair_level": wig.hair_level,
+            },
+            "thresholds": dataclasses.asdict(wig.thresholds),
+            "head": {
+                "face_axis": registration.face_axis,
+                "up_axis": registration.up_axis,
+                "certainty": registration.certainty,
+                "residual_mm": registration.residual_mm,
+                "head_to_scan": np.asarray(registration.matrix, float).tolist(),
+            },
+            "hair": {
+                "strands": len(hair),
+                "points": len(hair.points),
+                "guides": len(guides),
+                "mean_length_mm": float(lengths.mean()) if len(hair) else 0.0,
+                "mean_support": float(np.mean(hair.strand_attributes["support"])) if len(hair) else 0.0,
+            },
+            "stages": [{**cost, "tally": tallies.get(cost["name"], {})} for cost in self.costs],
+            "scores": refined.scores,
+            "settings": self.settings.to_dict(),
+            "warnings": self.warnings,
+        }
+        summary["stages"].append(
+            {"name": "result", "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": False, "tally": {}}
+        )
+        write_report(self.out, summary, wig.density, hair, guides, head, progress=part(progress, 0.3, 1.0))
+        seconds = time.monotonic() - self.begun
+        progress(1.0, 1.0)
+        return Reconstruction(hair, guides, registration.head, np.asarray(registration.matrix), summary, seconds)
+
+    def _template(self) -> HeadMesh:
+        path = self.settings.head.mesh
+        return load_obj(path) if path else template_head()
+
+    def _keys(self) -> dict[str, str]:
+        """The checkpoint key of each stage: all that its result depends on."""
+        depends: dict[str, dict[str, Any]] = {stage: {} for stage in STAGES[:-1]}
+        depends["scan"] = {"scan": fingerprint(self.scan), **self.raw}
+        depends["head"] = {"template": _digest(self.template.vertices, self.template.faces, self.template.scalp)}
+        for stage in ("guides", "dense", "refinement"):
+            depends[stage] = {"seed": self.settings.run.seed}
+        settings_of = {"dense": "interpolation"}
+        keys, previous = {}, chained_key("", version=__version__)
+        for stage, values in depends.items():
+            chosen = dataclasses.asdict(getattr(self.settings, settings_of.get(stage, stage)))
+            keys[stage] = previous = chained_key(previous, stage=stage, settings=chosen, **values)
+        return keys
+
+    def _stage(self, name: str, work: Callable[[Progress], Value], known: Value | None = None) -> Value:
+        """The stage's result, from its checkpoint (or `known`, read before) or by `work`; notes what it cost."""
+        self.observer.started(name, TEXTS[name])
+        progress, meter = self._progress(name), Meter()
+        result = self.checkpoints.load(name, self.keys[name]) if known is None else known
+        resumed = result is not None
+        if resumed:
+            self.resumed_share += SHARES[name]
+        else:
+            progress(0.0, 1.0)
+            result = work(progress)
+            self.checkpoints.save(name, self.keys[name], result)
+        self.costs.append({"name": name, "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": resumed})
+        progress(1.0, 1.0)
+        return result
+
+    def _progress(self, name: str) -> Progress:
+        """The stage's own progress, told to the observer with the share of the whole and the time that remains."""
+        before = sum(SHARES[stage] for stage in STAGES[: STAGES.index(name)])
+
+        def progress(done: float, total: float) -> None:
+            fraction = min(done / total, 1.0) if total > 0 else 1.0
+            whole = before + SHARES[name] * fraction
+            own = whole - self.resumed_share
+            elapsed = time.monotonic() - self.begun
+            remaining = elapsed * (1.0 - whole) / own if own > 0.02 and elapsed > 2.0 else None
+            self.observer.progressed(name, fraction, whole, remaining)
+
+        return progress
+
+    def _warn(self, warnings: Sequence[str]) -> None:
+        for text in warnings:
+            if text not in self.warnings:
+                self.warnings.append(text)
+                self.observer.warned(text)
+
+    def _check_memory(self, density: BrickVolume) -> None:
+        """Refuse before the long stages what would not fit the memory allowed."""
+        allowed = self.settings.run.memory or 0.75 * machine_memory()
+        needed = ENGINE_MEMORY + DENSITY_COPIES * density.nbytes / 1e9
+        if needed > allowed:
+            raise CT2HairError(
+                f"{self.scan}: the stages need about {needed:.1f} GB of memory, {allowed:.1f} GB are allowed; "
+                "set run.memory higher or scan.spacing coarser"
+            )
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """numba and torch held to `count` threads (0: all)."""
+    before = numba.get_num_threads()
+    most = numba.config.NUMBA_NUM_THREADS
+    numba.set_num_threads(min(count or most, most))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+@contextmanager
+def _own_folder(out: Path) -> Iterator[None]:
+    """`out` to ourselves: refuse a folder that another live run works in, and leave none behind that we made for nothing."""
+    made = not out.exists()
+    if out.exists() and not out.is_dir():
+        raise CT2HairError(f"{out}: is a file; name a folder for the result")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CT2HairError(f"{out}: the folder can't be made ({error.strerror}); choose another") from error
+    lock = out / ".running"
+    with lock.open("a") as file:
+        if not _locked(file):
+            raise CT2HairError(f"{out}: another reconstruction is writing there; wait for it or choose another folder")
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+            if made and not any(out.iterdir()):
+                out.rmdir()
+
+
+def _locked(file: IO) -> bool:
+    """Lock an open file for this process until it is closed; False where another process holds it."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,71 @@
+"""The head as a boundary of the refinement: which points may move against it, and what of a strand the scan can show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..volume.strand_signal import outward
+from .motion import keep_outside
+
+NEAR = 4.0
+"""Distance from the head, mm, within which a point is held to a tangent plane."""
+MARGIN = 0.05
+"""Distance, mm, that free points keep from the head."""
+LAST_PUSHES = 6
+
+
+class Boundary:
+    """The head's tangent planes near strands, taken anew by `look`; `push` moves points out of them.
+
+    head answers `signed_distance(points (M, 3) float32) -> (M,)`, mm, negative inside. floor: distance from the head, mm,
+    below which the scan shows no hair (net cut away). ramp: mm over which strands fade in above it, a voxel of the scan.
+    """
+
+    def __init__(self, head, floor: float, ramp: float) -> None:
+        self.head, self.floor, self.ramp = head, floor, ramp
+        self.near = np.zeros(0, bool)
+        self.plane = np.zeros((0, 4))
+        self._distance = np.zeros(0)
+        self._seen_at = np.zeros((0, 3))
+
+    def look(self, points: np.ndarray) -> np.ndarray:
+        """Take the planes at `points` (M, 3); returns (M,) float64: how much of each point the scan can show, 0..1."""
+        if len(self._seen_at) != len(points):
+            stale = np.ones(len(points), bool)
+            self._distance, self._seen_at = np.zeros(len(points)), points.copy()
+        else:
+            # The distance changes no faster than a point moves: far points need no second look until they may be near.
+            moved = np.linalg.norm(points - self._seen_at, axis=1)
+            stale = self._distance - moved < NEAR
+        self._distance[stale] = self.head.signed_distance(points[stale].astype(np.float32))
+        self._seen_at[stale] = points[stale]
+        self.near = self._distance < NEAR
+        self.plane = np.zeros((len(points), 4))
+        rows = np.flatnonzero(self.near)
+        normal = outward(points[rows], self.head)
+        self.plane[rows, :3] = normal
+        self.plane[rows, 3] = np.einsum("ij,ij->i", normal, points[rows]) - self._distance[rows]
+        if self.floor <= 0.0:
+            return np.ones(len(points))
+        return np.clip((self._distance - self.floor) / self.ramp + 0.5, 0.0, 1.0)
+
+    def push(self, points: np.ndarray, offsets: np.ndarray) -> None:
+        """Move points inside the planes out of them, in place; roots stay."""
+        keep_outside(points, offsets, self.near, self.plane, MARGIN)
+
+    def clear(self, points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, int]:
+        """Points (M, 3) with none inside the head but roots, and how many were. Exact, by repeated pushes."""
+        points = np.array(points, np.float64)
+        root = np.zeros(len(points), bool)
+        root[offsets[:-1]] = True
+        rows = np.flatnonzero(~root)
+        found = 0
+        for attempt in range(LAST_PUSHES):
+            distance = np.asarray(self.head.signed_distance(points[rows].astype(np.float32)), np.float64)
+            inside = distance < 0.5 * MARGIN
+            rows, distance = rows[inside], distance[inside]
+            found = found or len(rows)
+            if not len(rows):
+                break
+            points[rows] += (MARGIN - distance + 0.02 * attempt)[:, None] * outward(points[rows], self.head)
+        return points, found

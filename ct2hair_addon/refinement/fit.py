@@ -1,0 +1,127 @@
+"""The default refinement: all strands at once against the volume, coarse to fine (in place of the paper's 3.3.2 Chamfer).
+
+Strands are rendered through the scanner's blur, the misfit to the scan is blurred back into a potential, and every strand
+moves down its slope as a stiff curve with a pinned root, kept lengths and no point inside the head.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..progress import Progress, part, silent
+from ..settings import RefinementSettings
+from ..volume import BrickVolume
+from ..volume.strand_signal import StrandProfile
+from .boundary import Boundary
+from .motion import gather_forces, keep_lengths, stiff_step
+from .splat import blurred, halved, misfit
+
+LEVEL_BLUR = 0.85
+"""Blur of the coarser levels, voxels: as sharp as trilinear reading allows."""
+HALVING_VARIANCE = 1.0 / 16.0
+"""Variance, coarse voxels^2, that the mean of two voxels adds along an axis."""
+RELAXATION = 0.7
+FRICTION = 0.5
+"""Share of a Newton step that is taken, and of the last step that goes on: together just short of overshooting."""
+STEP_LIMIT = 0.5
+"""Longest move in one iteration, voxels: within the reach of the potential that it follows."""
+LENGTH_SWEEPS = 4
+PLANES_EVERY = 10
+"""Iterations after which the head's tangent planes are taken anew; a point moves a few voxels at most in between."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One step of the pyramid: the scan at some voxel size and the blur of a strand there, voxels."""
+
+    scan: BrickVolume
+    blur: float
+
+
+def pyramid(density: BrickVolume, blur: float, coarsest: float) -> list[Level]:
+    """The scan at its own voxel size, twice that, and so on up to `coarsest` mm; coarsest first."""
+    levels = [Level(density, blur)]
+    while 2.0 * levels[-1].scan.spacing <= 1.1 * coarsest:
+        coarse = halved(levels[-1].scan)
+        kept = np.sqrt((levels[-1].blur / 2.0) ** 2 + HALVING_VARIANCE)
+        extra = np.sqrt(max(LEVEL_BLUR**2 - kept**2, 0.0))
+        bricks = blurred(coarse, extra) if extra > 0.2 else coarse.bricks
+        scan = BrickVolume(coarse.table, bricks, coarse.spacing, coarse.origin, coarse.background)
+        levels.append(Level(scan, float(np.sqrt(kept**2 + extra**2))))
+    return levels[::-1]
+
+
+def shares(iterations: int, levels: int) -> list[int]:
+    """How the iterations are shared out: half to the finest level, the rest evenly to the coarser ones."""
+    if levels == 1:
+        return [iterations]
+    coarse = [(iterations // 2) // (levels - 1)] * (levels - 1)
+    return [*coarse, iterations - sum(coarse)]
+
+
+def fit_to_volume(
+    points: np.ndarray,
+    offsets: np.ndarray,
+    density: BrickVolume,
+    profile: StrandProfile,
+    boundary: Boundary,
+    settings: RefinementSettings,
+    progress: Progress = silent,
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
+    points = np.array(points, np.float64)
+    rest_lengths = segment_lengths(points, offsets)
+    levels = pyramid(density, profile.blur, settings.coarsest)
+    plan = shares(settings.iterations, len(levels))
+    cost = np.array(plan) * (0.2 + np.array([len(level.scan.bricks) for level in levels]) / len(density.bricks))
+    done = np.concatenate([[0.0], np.cumsum(cost)]) / max(cost.sum(), 1e-9)
+    tally = {"control points": len(points)}
+    for number, (level, count) in enumerate(zip(levels, plan, strict=True)):
+        stage = part(progress, done[number], done[number + 1])
+        size = level.scan.spacing
+        stiffness = max(settings.stiffness, 2.0 * size)
+        gain = profile.line_mass / size**2
+        newton = 8.0 * np.pi * level.blur**4 / gain
+        residual, potential = np.empty_like(level.scan.bricks), np.empty_like(level.scan.bricks)
+        forces, weights = np.empty_like(points), np.empty(len(points))
+        velocity = np.zeros_like(points)
+        rest = points.copy()
+        for iteration in range(count):
+            step = part(stage, iteration / count, (iteration + 1) / count)
+            if iteration % PLANES_EVERY == 0:
+                visible = boundary.look(points)
+            voxels = level.scan.to_voxel(points)
+            error = misfit(voxels, offsets, visible, level.scan, level.blur, gain, residual, part(step, 0.0, 0.6))
+            field = BrickVolume(level.scan.table, residual, size, level.scan.origin)
+            blurred(field, level.blur, potential, part(step, 0.6, 0.9))
+            gather_forces(voxels, offsets, visible, level.scan.table, potential, forces, weights)
+            forces *= newton * size
+            stiff_step(
+                points, rest, offsets, forces, weights, stiffness, RELAXATION, FRICTION, STEP_LIMIT * size, velocity
+            )  # fmt: skip
+            keep_lengths(points, offsets, rest_lengths, LENGTH_SWEEPS)
+            boundary.push(points, offsets)
+            if iteration == 0:
+                tally[f"misfit before, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))
+        if count:
+            tally[f"misfit after, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))
+        tally["iterations"] = tally.get("iterations", 0) + count
+    progress(1.0, 1.0)
+    return points, tally
+
+
+def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(M,) the distance from each point to the next of its strand; 0 at tips."""
+    lengths = np.zeros(len(points))
+    lengths[:-1] = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    lengths[offsets[1:][np.diff(offsets) > 0] - 1] = 0.0
+    return lengths
+
+
+def _scale(scan: BrickVolume) -> float:
+    """Half the square sum of the scan: what a misfit is a share of."""
+    chunks = range(0, len(scan.bricks), 1024)
+    total = sum(float(np.square(scan.bricks[at : at + 1024]).sum(dtype=np.float64)) for at in chunks)
+    return max(0.5 * total, 1e-12)

@@ -1,0 +1,92 @@
+"""Stage 6: dense strands moved to fit the scan (paper 3.3.2), by the volume itself or by the paper's Chamfer distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..progress import Progress, part, silent
+from ..settings import RefinementSettings
+from ..strands import Strands
+from ..volume import BrickVolume
+from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
+from .agreement import agreements
+from .boundary import Boundary
+from .curves import control_points, polylines
+from .fit import fit_to_volume
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Strands fitted to the scan.
+
+    strands: mm, scan frame, root first, with strand attributes `root_uv` (where given) and `support` (N,) and the point
+    attribute `support` (M,): 0 (made up) to 1 (backed by the scan). tally: counts in plain English.
+    scores: {"before" | "after": {voxel size in mm: {"iou", "precision", "recall"}}} against the scan itself.
+    """
+
+    strands: Strands
+    tally: dict[str, int]
+    scores: dict[str, dict[str, dict[str, float]]]
+
+
+def refine(
+    strands: Strands,
+    density: BrickVolume,
+    hair_level: float,
+    head,
+    settings: RefinementSettings | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    profile: StrandProfile | None = None,
+) -> Refined:
+    """Fit strands to the scan that they came from: roots stay where they are, lengths and curls are kept.
+
+    strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
+    voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
+    measured on the strands where not given. The same input and seed give the same bits on any number of threads. Raises
+    Cancelled (by progress).
+    """
+    settings = settings or RefinementSettings()
+    progress(0.0, 1.0)
+    finite = np.bincount(strands.strand_index, ~np.isfinite(strands.points).all(axis=1), len(strands)) == 0
+    kept = strands.select(finite & (strands.counts >= 2))
+    tally = {"strands": len(kept), "dropped: not finite or fewer than two points": len(strands) - len(kept)}
+    if not len(kept) or not len(density.bricks):
+        return Refined(_supported(kept, density, hair_level), tally, {})
+    profile = profile or lone_profile(density, hair_level, kept, progress=part(progress, 0.0, 0.05))
+    tally["pieces of lone strands measured"] = profile.pieces
+    tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
+    boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
+    points, offsets = control_points(kept, settings.points)
+    first = (Strands(points, offsets), boundary.look(points))
+    if settings.iterations:
+        step = part(progress, 0.05, 0.9)
+        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, step)
+        tally |= counts
+    last = (Strands(points, offsets), boundary.look(points))
+    before, after = agreements([first, last], density, profile, progress=part(progress, 0.9, 0.98))
+    fine, fine_offsets = polylines(points, offsets)
+    fine[fine_offsets[:-1]] = kept.roots
+    cleared, inside = boundary.clear(fine, fine_offsets)
+    tally["points pushed out of the head at the end"] = int(inside)
+    result = _supported(Strands(cleared, fine_offsets, kept.strand_attributes), density, hair_level)
+    progress(1.0, 1.0)
+    return Refined(result, tally, {"before": before, "after": after})
+
+
+def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, progress):
+    """The control points after the chosen method, and its tally."""
+    if settings.method == "chamfer":
+        from .chamfer import fit_to_points  # torch takes seconds to import: only who asks for it pays
+
+        return fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, progress)
+    return fit_to_volume(points, offsets, density, profile, boundary, settings, progress)
+
+
+def _supported(strands: Strands, density: BrickVolume, hair_level: float) -> Strands:
+    """The strands with `support` per strand and per point."""
+    per_point, per_strand = support_along(strands, density, hair_level)
+    attributes = {**strands.strand_attributes, "support": per_strand}
+    return Strands(strands.points, strands.offsets, attributes, {"support": per_point})

@@ -1,0 +1,283 @@
+"""What strands look like in a scan: the profile of a lone strand, the mass of all hair, and what the scan backs along strands.
+
+Density is linear in hair: a strand adds its `line_mass` per mm of its length, spread over a Gaussian cross-section by the
+scanner (supplement 3 of the paper, read backwards). So the profile of one strand turns density into length of hair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from ..progress import Progress, silent
+from ..strands import Strands
+from .grid import BrickVolume, trilinear
+
+TYPICAL_BLUR = 0.85
+"""Gaussian blur of a scan, voxels, taken where no lone strand can be measured (0.8 to 0.9 in the paper's scans)."""
+
+INTERPOLATION_VARIANCE = 1.0 / 6.0
+"""Variance, voxels^2, that trilinear sampling adds to a profile: that of the triangle of half-width one."""
+
+PIECE_POINTS = 9
+RING_STEP = 0.5
+RINGS = 11
+ANGLES = 12
+CORE_RINGS = 7
+"""A piece is 9 points a voxel apart; its cross-section is sampled on 12 angles and rings 0, 0.5, ... 5 voxels. Rings up to
+3 voxels (core) hold more than 99 % of a strand's mass at a blur of 0.9; those from 3.5 on (moat) tell whether it is alone."""
+
+MAX_PIECES = 60_000
+MIN_LONE_PIECES = 40
+BEST_SHARE = 0.02
+FLOOR_QUANTILE = 2e-4
+SLOPE_STEP = 0.25
+"""Step of the central differences that give the gradient of the head's distance, mm."""
+
+
+@dataclass(frozen=True)
+class StrandProfile:
+    """One strand's signature in a scan.
+
+    peak: density on the axis of a lone straight strand, above air. blur: standard deviation of its Gaussian cross-section,
+    voxels. line_mass: integral of density over the cross-section, density * mm^2; the mass of 1 mm of hair.
+    pieces: lone pieces that it was measured on; 0 where typical values had to do.
+    """
+
+    peak: float
+    blur: float
+    line_mass: float
+    pieces: int
+
+
+def lone_profile(
+    density: BrickVolume, hair_level: float, strands: Strands, peak: float = 0.0, progress: Progress = silent
+) -> StrandProfile:
+    """The profile of a lone strand, measured where pieces of `strands` (mm, scan frame) run alone through the scan.
+
+    The cross-section of each piece is averaged along it; the pieces with the emptiest moat around them count, and the
+    typical one (half-sample mode, deaf to pairs that lie in one another) is taken. With too few of them, `peak`
+    (the peak of a lone strand, if known) or the thinner strands' density along the guides and a typical blur stand in.
+    """
+    lines = strands.resampled_by_step(density.spacing) if len(strands) else strands
+    per_strand = np.maximum(lines.counts // PIECE_POINTS, 0) if len(strands) else np.zeros(0, np.int64)
+    firsts = _piece_starts(lines.offsets, per_strand)
+    if len(firsts) > MAX_PIECES:
+        firsts = firsts[np.linspace(0, len(firsts) - 1, MAX_PIECES).astype(np.int64)]
+    voxels = density.to_voxel(lines.points)
+    images = np.empty((len(firsts), RINGS, ANGLES), np.float32)
+    straight = np.empty(len(firsts), np.float32)
+    chunk = 4000
+    for start in range(0, len(firsts), chunk):
+        progress(start, len(firsts))
+        part = slice(start, start + chunk)
+        _cross_sections(
+            density.table, density.bricks, np.float32(density.background), voxels, firsts[part], images[part], straight[part]
+        )
+    measured = _typical_lone(images, straight, hair_level, density.spacing)
+    if measured is not None:
+        return measured
+    axis = images[:, :2].mean(axis=(1, 2)) if len(images) else np.zeros(0)
+    axis = axis[axis > hair_level]
+    if peak <= 0.0:
+        peak = float(np.quantile(axis, 0.2)) if len(axis) else 2.0 * hair_level
+    return StrandProfile(peak, TYPICAL_BLUR, peak * 2.0 * np.pi * (TYPICAL_BLUR * density.spacing) ** 2, 0)
+
+
+def _typical_lone(images: np.ndarray, straight: np.ndarray, hair_level: float, spacing: float) -> StrandProfile | None:
+    """The profile from polar cross-sections (L, RINGS, ANGLES) of pieces; None where too few run alone."""
+    if not len(images):
+        return None
+    radius = RING_STEP * np.arange(RINGS)
+    profile = images.mean(axis=2)
+    area = 2.0 * np.pi * radius * RING_STEP
+    area[0] = np.pi * (RING_STEP / 2) ** 2
+    moat = profile[:, CORE_RINGS:].mean(axis=1)
+    crowding = np.abs(images[:, CORE_RINGS:].mean(axis=1)).max(axis=1)
+    core = profile[:, :CORE_RINGS] - moat[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mass = core @ area[:CORE_RINGS]
+        angle = 2.0 * np.pi * np.arange(ANGLES) / ANGLES
+        weight = (images[:, :CORE_RINGS] - moat[:, None, None]) * (area * radius / ANGLES)[None, :CORE_RINGS, None]
+        centre = np.hypot((weight * np.cos(angle)).sum((1, 2)), (weight * np.sin(angle)).sum((1, 2))) / mass
+        variance = (core @ (area * radius**2)[:CORE_RINGS] / mass - centre**2) / 2.0 - INTERPOLATION_VARIANCE
+    axis = profile[:, :2].mean(axis=1)
+    usable = (axis > hair_level) & (mass > 0.0) & (straight > 0.97) & (centre < 0.8) & np.isfinite(variance)
+    alone = usable & (crowding < 0.2 * axis) & (np.abs(moat) < 0.08 * axis)
+    if np.count_nonzero(alone) < MIN_LONE_PIECES:
+        return None
+    rows = np.flatnonzero(alone)
+    order = np.argsort(crowding[rows] / axis[rows], kind="stable")
+    rows = rows[order[: max(MIN_LONE_PIECES, int(BEST_SHARE * len(images)))]]
+    mass_mode = half_sample_mode(mass[rows])
+    near = rows[np.abs(mass[rows] - mass_mode) < 0.35 * mass_mode]
+    line_mass = float(np.median(mass[near]))
+    blur = _untruncated(float(np.median(variance[near])))
+    contained = 1.0 - np.exp(-((RING_STEP * (CORE_RINGS - 0.5)) ** 2) / (2.0 * (blur**2 + INTERPOLATION_VARIANCE)))
+    line_mass *= spacing**2 / contained
+    return StrandProfile(line_mass / (2.0 * np.pi * (blur * spacing) ** 2), blur, line_mass, len(near))
+
+
+def _untruncated(variance: float) -> float:
+    """The blur, voxels, of a Gaussian whose second moment out to the core's edge, less the sampling's, is `variance`."""
+    reach = RING_STEP * (CORE_RINGS - 0.5)
+    measured = full = variance + INTERPOLATION_VARIANCE
+    for _ in range(20):
+        q = reach**2 / (2.0 * full)
+        full = min(measured / (1.0 - q * np.exp(-q) / (1.0 - np.exp(-q))), 2.0)
+    return float(np.sqrt(np.clip(full - INTERPOLATION_VARIANCE, 0.6**2, 1.4**2)))
+
+
+def half_sample_mode(values: np.ndarray) -> float:
+    """The mode of a sample: the middle of ever denser halves (Bickel and Fruehwirth 2006)."""
+    values = np.sort(np.asarray(values, np.float64))
+    while len(values) > 3:
+        half = (len(values) + 1) // 2
+        start = int(np.argmin(values[half - 1 :] - values[: len(values) - half + 1]))
+        values = values[start : start + half]
+    return float(np.mean(values))
+
+
+def hair_mass(density: BrickVolume, progress: Progress = silent) -> float:
+    """The integral of density over the scan, density * mm^3: the mass of all hair. Noise around it, being signed, cancels."""
+    sums = np.empty(len(density.bricks))
+    chunk = 2048
+    for start in range(0, len(sums), chunk):
+        progress(start, len(sums))
+        sums[start : start + chunk] = density.bricks[start : start + chunk].sum(axis=(1, 2, 3), dtype=np.float64)
+    return float(sums.sum() * density.spacing**3)
+
+
+def data_floor(density: BrickVolume, hair_level: float, head, sample: int = 200_000) -> float:
+    """The distance from the head, mm, below which the scan holds no hair because the hairnet was cut away (0 or more).
+
+    `head` answers `signed_distance(points)`. A low quantile over a sample of hair voxels: robust to a few left-overs.
+    """
+    per_brick = np.count_nonzero(density.bricks > hair_level, axis=(1, 2, 3))
+    total = int(per_brick.sum())
+    if total == 0:
+        return 0.0
+    centres = density.to_scan(16.0 * density.brick_index + 7.5)
+    reach = head.signed_distance(centres.astype(np.float32))
+    near = np.flatnonzero((per_brick > 0) & (reach < 16.0 * density.spacing))
+    if not len(near):
+        return 0.0
+    keep = max(1, int(np.ceil(per_brick[near].sum() / sample)))
+    row, x, y, z = np.nonzero(density.bricks[near] > hair_level)
+    row, x, y, z = row[::keep], x[::keep], y[::keep], z[::keep]
+    points = density.to_scan(16 * density.brick_index[near[row]] + np.stack([x, y, z], axis=1))
+    distance = head.signed_distance(points.astype(np.float32))
+    return float(max(np.quantile(distance, min(1.0, FLOOR_QUANTILE * total / per_brick[near].sum())), 0.0))
+
+
+def outward(points: np.ndarray, head) -> np.ndarray:
+    """(M, 3) float64 unit gradients of the head's distance at `points`, by central differences."""
+    steps = SLOPE_STEP * np.concatenate([np.eye(3), -np.eye(3)])
+    values = head.signed_distance((points[None] + steps[:, None]).reshape(-1, 3).astype(np.float32))
+    values = np.asarray(values, np.float64).reshape(6, -1)
+    slope = (values[:3] - values[3:]).T
+    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+
+
+def support_along(
+    strands: Strands, density: BrickVolume, hair_level: float, window: float = 1.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the scan backs: (M,) float32 per point and (N,) float32 per strand, 0 (made up) to 1 (lies in hair).
+
+    The density along the strand, averaged over `window` mm to either side against noise, in units of `hair_level`, cut at
+    1; a strand's value is the mean over its length.
+    """
+    steps = strands.resampled_by_step(density.spacing)
+    values = density.sample(steps.points)
+    reach = max(1, round(window / density.spacing))
+    backed = np.empty(len(values), np.float32)
+    per_strand = np.zeros(len(strands), np.float32)
+    _backed_along(values, steps.offsets, np.int64(reach), np.float32(max(hair_level, 1e-9)), backed, per_strand)
+    per_point = np.empty(len(strands.points), np.float32)
+    _at_points(strands.arc_lengths(), strands.offsets, backed, steps.offsets, per_point)
+    return per_point, per_strand
+
+
+def _piece_starts(offsets: np.ndarray, per_strand: np.ndarray) -> np.ndarray:
+    """(L,) int64: the first point of each piece of PIECE_POINTS points."""
+    begin = np.concatenate([[0], np.cumsum(per_strand)])
+    strand = np.repeat(np.arange(len(per_strand)), per_strand)
+    return offsets[:-1][strand] + (np.arange(begin[-1]) - begin[strand]) * PIECE_POINTS
+
+
+@numba.njit(cache=True, parallel=True)
+def _cross_sections(table, bricks, background, voxels, firsts, images, straight):
+    for n in numba.prange(len(firsts)):
+        first = firsts[n]
+        tx = voxels[first + PIECE_POINTS - 1, 0] - voxels[first, 0]
+        ty = voxels[first + PIECE_POINTS - 1, 1] - voxels[first, 1]
+        tz = voxels[first + PIECE_POINTS - 1, 2] - voxels[first, 2]
+        chord = np.sqrt(tx * tx + ty * ty + tz * tz)
+        arc = 0.0
+        for m in range(first, first + PIECE_POINTS - 1):
+            arc += np.sqrt(
+                (voxels[m + 1, 0] - voxels[m, 0]) ** 2
+                + (voxels[m + 1, 1] - voxels[m, 1]) ** 2
+                + (voxels[m + 1, 2] - voxels[m, 2]) ** 2
+            )
+        straight[n] = chord / arc if arc > 0.0 else 0.0
+        if chord <= 0.0:
+            images[n] = 0.0
+            continue
+        tx, ty, tz = tx / chord, ty / chord, tz / chord
+        ux, uy, uz = ty, -tx, 0.0
+        if abs(tz) > 0.7:
+            ux, uy, uz = 0.0, tz, -ty
+        norm = np.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / norm, uy / norm, uz / norm
+        vx, vy, vz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
+        for ring in range(RINGS):
+            for step in range(ANGLES):
+                angle = 2.0 * np.pi * step / ANGLES
+                a, b = RING_STEP * ring * np.cos(angle), RING_STEP * ring * np.sin(angle)
+                total = 0.0
+                for m in range(first, first + PIECE_POINTS):
+                    total += trilinear(
+                        table,
+                        bricks,
+                        background,
+                        voxels[m, 0] + a * ux + b * vx,
+                        voxels[m, 1] + a * uy + b * vy,
+                        voxels[m, 2] + a * uz + b * vz,
+                    )
+                images[n, ring, step] = total / PIECE_POINTS
+
+
+@numba.njit(cache=True, parallel=True)
+def _backed_along(values, offsets, reach, level, backed, per_strand):
+    for n in numba.prange(len(offsets) - 1):
+        start, end = offsets[n], offsets[n + 1]
+        total = 0.0
+        for m in range(start, end):
+            first, last = max(start, m - reach), min(end, m + reach + 1)
+            mean = 0.0
+            for i in range(first, last):
+                mean += values[i]
+            mean /= last - first
+            backed[m] = min(max(mean / level, 0.0), 1.0)
+            total += backed[m]
+        if end > start:
+            per_strand[n] = total / (end - start)
+
+
+@numba.njit(cache=True, parallel=True)
+def _at_points(arc, offsets, values, steps, out):
+    """Values at equal steps along each strand, read off linearly at its own points."""
+    for n in numba.prange(len(offsets) - 1):
+        start, end = offsets[n], offsets[n + 1]
+        if end == start:
+            continue
+        length = arc[end - 1]
+        count = steps[n + 1] - steps[n]
+        for m in range(start, end):
+            place = arc[m] / length * (count - 1) if length > 0.0 else 0.0
+            i = min(int(place), count - 2)
+            t = place - i
+            out[m] = (1.0 - t) * values[steps[n] + i] + t * values[steps[n] + i + 1]

@@ -1,0 +1,115 @@
+"""From segments to rooted strands on a ball of a head: fine and poor, directions, growing, roots on the scalp."""
+
+import numpy as np
+import pytest
+
+from ct2hair_addon.guides import root_segments
+from ct2hair_addon.guides.direction import fine_ends, signs
+from ct2hair_addon.guides.growing import grow_to_root, lead_into_scalp, push_out
+from ct2hair_addon.head import Head, HeadMesh
+from ct2hair_addon.settings import GuideSettings
+from ct2hair_addon.strands import Strands
+
+RADIUS = 80.0
+
+
+@pytest.fixture(scope="module")
+def ball() -> Head:
+    """A sphere whose upper half is scalp."""
+    rows, columns = 40, 80
+    polar = np.linspace(0, np.pi, rows + 1)[1:-1]
+    around = np.arange(columns) * 2 * np.pi / columns
+    east, north = np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around))
+    ring = np.stack([east, north, np.outer(np.cos(polar), np.ones(columns))], -1)
+    vertices = np.concatenate([[[0, 0, 1]], ring.reshape(-1, 3), [[0, 0, -1]]]) * RADIUS
+    faces = []
+    for c in range(columns):
+        d = (c + 1) % columns
+        faces.append((0, 1 + c, 1 + d))
+        for r in range(rows - 2):
+            a, b, e, f = (1 + r * columns + c, 1 + r * columns + d, 1 + (r + 1) * columns + c, 1 + (r + 1) * columns + d)
+            faces += [(a, e, f), (a, f, b)]
+        faces.append((len(vertices) - 1, 1 + (rows - 2) * columns + d, 1 + (rows - 2) * columns + c))
+    uv = np.full((len(vertices), 2), np.nan)
+    return Head(HeadMesh(vertices, np.array(faces), vertices[:, 2] > 10, uv))
+
+
+def hair(azimuth: float, start: float, end: float, lift=0.5) -> np.ndarray:
+    """A stretch [start, end] mm of a hair that leaves the ball at 45 degrees up and hangs over outwards."""
+    s = np.arange(start, end, 0.5)
+    outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    root = RADIUS * (np.cos(np.pi / 4) * outwards + [0, 0, np.sin(np.pi / 4)])
+    away = root / RADIUS
+    return root + s[:, None] * away + (s**2 * 0.004)[:, None] * (outwards - [0, 0, 1.0])
+
+
+def test_a_long_segment_from_the_scalp_is_fine_and_a_far_one_poor(ball):
+    lines = [hair(0.0, 2, 90), hair(0.1, 2, 90)[::-1], hair(0.2, 30, 90), hair(0.3, 5, 25), hair(0.4, 2, 12)]
+    strands = Strands.from_polylines(lines)
+    assert fine_ends(strands, ball, GuideSettings()).tolist() == [1, -1, 0, 0, 1]
+
+
+def test_poor_segments_take_the_direction_of_their_neighbours(ball):
+    lines = [hair(a, 2, 80) for a in np.linspace(0, 0.3, 12)]
+    lines += [hair(a, 30, 70)[:: (-1 if n % 2 else 1)] for n, a in enumerate(np.linspace(0.01, 0.29, 11))]
+    strands = Strands.from_polylines(lines)
+    fine = fine_ends(strands, ball, GuideSettings())
+    value = signs(strands, fine, ball, GuideSettings())
+    assert (value[:12] > 0).all()
+    assert (np.sign(value[12:]) == [-1 if n % 2 else 1 for n in range(11)]).all()
+
+
+def test_growing_follows_the_neighbours_in_rounds(ball):
+    # Each hair is farther from the only rooted one: the last is out of its reach, not out of its neighbours'.
+    lines = [hair(0.0, 2, 80)] + [hair(0.025 * n, 40, 80) for n in range(1, 6)] + [hair(2.5, 40, 80)]
+    strands = Strands.from_polylines(lines)
+    grown, reached, added = grow_to_root(strands, np.arange(7) == 0, GuideSettings())
+    assert reached.tolist() == [True] * 6 + [False]
+    np.testing.assert_allclose(added[1:6], 38, atol=4)
+    scalp = ball.closest_scalp(grown.roots[:6])
+    assert scalp.distance.max() < 5
+    np.testing.assert_array_equal(grown.tips, strands.tips)
+
+
+def test_the_lead_starts_on_the_scalp_and_goes_on_smoothly(ball):
+    strands = Strands.from_polylines([hair(a, 6, 60) for a in np.linspace(0, 6, 40)])
+    led, added = lead_into_scalp(strands, ball)
+    assert ball.closest_scalp(led.roots).distance.max() < 1e-3
+    assert (added > 4).all() and (added < 12).all()
+    for line in led.resampled_by_step(1.0).polylines():
+        steps = np.diff(line, axis=0)
+        steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+        assert (steps[1:] * steps[:-1]).sum(1).min() > np.cos(np.radians(25))
+
+
+def test_points_inside_are_pushed_out(ball):
+    line = np.stack([np.linspace(-40, 40, 80), np.zeros(80), np.full(80, 75.0)], 1)
+    out, count = push_out(Strands.from_polylines([line]), ball)
+    assert count > 40
+    assert ball.signed_distance(out.points[1:]).min() > 0
+
+
+def test_rooted_strands_have_all_that_is_promised(ball):
+    rng = np.random.default_rng(0)
+    lines = [hair(a, 2, 80) for a in np.linspace(0, 1, 60)]
+    lines += [hair(a, 30, 75)[:: rng.choice([-1, 1])] for a in rng.uniform(0, 1, 40)] + [hair(3.0, 40, 60)]
+    guides, tally = root_segments(Strands.from_polylines(lines), 0.4, ball, GuideSettings())
+    assert len(guides) == 100 and tally["dropped: no rooted hair near"] == 1
+    root = ball.closest_scalp(guides.roots)
+    assert root.distance.max() < 0.05
+    np.testing.assert_allclose(guides.strand_attributes["root_uv"], root.uv, atol=1e-5)
+    support = guides.strand_attributes["support"]
+    assert support.dtype == np.float32 and support.min() > 0.4 and support.max() <= 1
+    assert support[:60].min() > support[60:].max()
+    inner = np.ones(len(guides.points), bool)
+    inner[guides.offsets[:-1]] = False
+    assert ball.signed_distance(guides.points[inner]).min() > 0
+    assert guides.tips[:, 2].max() < guides.roots[:, 2].min() + 80
+    assert (np.linalg.norm(guides.tips, axis=1) > np.linalg.norm(guides.roots, axis=1)).all()
+
+
+def test_nothing_found_is_no_guides(ball):
+    empty = Strands(np.zeros((0, 3), np.float32), np.zeros(1, np.int64))
+    guides, tally = root_segments(empty, 0.4, ball, GuideSettings())
+    assert len(guides) == 0 and tally["guides"] == 0
+    assert set(guides.strand_attributes) == {"support", "root_uv"}

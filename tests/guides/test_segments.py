@@ -1,0 +1,149 @@
+"""Tracing and subtracting on phantoms: a lone strand, a bundle, a crossing, a helix, noise, threads."""
+
+from itertools import pairwise
+
+import numba
+import numpy as np
+import pytest
+
+from ct2hair_addon.errors import Cancelled
+from ct2hair_addon.guides import find_segments
+from ct2hair_addon.guides.sampling import centred, density_at
+from ct2hair_addon.guides.trace import add_strand, smoothed
+from ct2hair_addon.orientation import orientation_field
+from ct2hair_addon.settings import GuideSettings, OrientationSettings
+from ct2hair_addon.volume import BrickVolume
+
+PEAK, BLUR, SPACING = 100.0, 0.85, 0.4
+ORIGIN = np.array([3.0, -7.0, 11.0])
+
+
+def scan(curves, shape, snr=None, seed=0) -> BrickVolume:
+    """Strands (voxels, points about a voxel apart) as the scanner sees them; every brick stored."""
+    size = tuple(-(-n // 16) for n in shape)
+    table = np.arange(np.prod(size), dtype=np.int32).reshape(size)
+    bricks = np.zeros((table.size, 16, 16, 16), np.float32)
+    for curve in curves:
+        add_strand(table, bricks, np.asarray(curve, np.float32), np.full(len(curve), PEAK), BLUR)
+    if snr:
+        bricks += np.random.default_rng(seed).normal(0, PEAK / snr, bricks.shape).astype(np.float32)
+    return BrickVolume(table, bricks, SPACING, ORIGIN)
+
+
+def straight(start, end):
+    start, end = np.array(start, float), np.array(end, float)
+    count = int(np.linalg.norm(end - start)) + 1
+    return start + np.linspace(0, 1, count)[:, None] * (end - start)
+
+
+def traced(volume, **changes):
+    field = orientation_field(volume, 0.35 * PEAK, OrientationSettings())
+    segments, profile, tally = find_segments(volume, 0.35 * PEAK, field, GuideSettings(**changes), 0)
+    return [volume.to_voxel(line) for line in segments.polylines()], profile, tally
+
+
+def distances(line, curve):
+    """Distance of each point of `line` from the polyline `curve`, sampled densely."""
+    fine = np.concatenate([a + np.linspace(0, 1, 9)[:, None] * (b - a) for a, b in pairwise(curve)])
+    return np.sqrt(((line[:, None] - fine[None]) ** 2).sum(-1).min(1))
+
+
+@pytest.mark.parametrize("snr", [None, 4.0])
+def test_a_lone_strand_is_one_segment_on_its_centre_line(snr):
+    curve = straight((10, 12, 8), (52, 40, 56))
+    lines, profile, tally = traced(scan([curve], (64, 64, 64), snr))
+    assert len(lines) == 1
+    assert distances(lines[0], curve).max() < (0.1 if snr is None else 0.6)
+    assert np.linalg.norm(lines[0][-1] - lines[0][0]) == pytest.approx(np.linalg.norm(curve[-1] - curve[0]), abs=5)
+    assert profile.blur == pytest.approx(BLUR, abs=0.15)
+    assert profile.peak == pytest.approx(PEAK, rel=0.2)
+    assert sum(count for name, count in tally.items() if name.startswith("ended")) == 2
+
+
+def test_neighbours_that_touch_are_both_found():
+    curves = [straight((8, 20, 20), (56, 20, 20)), straight((8, 22.2, 20), (56, 22.2, 20)), straight((8, 40, 40), (56, 44, 40))]
+    lines, _, _ = traced(scan(curves, (64, 64, 64)))
+    for curve in curves:
+        assert max(np.mean(distances(curve, line) < 0.7) for line in lines) > 0.8
+    assert sum(len(line) for line in lines) < 1.2 * sum(len(curve) for curve in curves)
+
+
+def test_a_crossing_is_gone_through_straight():
+    curves = [straight((8, 32, 32), (56, 32, 32)), straight((14, 14, 32), (50, 50, 32))]
+    lines, _, _ = traced(scan(curves, (64, 64, 64)))
+    assert len(lines) == 2
+    for curve in curves:
+        assert min(distances(line, curve).max() for line in lines) < 0.8
+
+
+def test_a_helix_is_followed():
+    t = np.linspace(0, 4 * np.pi, 330)
+    curve = np.stack([32 + 14 * np.cos(t), 32 + 14 * np.sin(t), 8 + 3.5 * t], 1)
+    lines, _, _ = traced(scan([curve], (64, 64, 64), snr=4.0))
+    found = max(lines, key=len)
+    assert np.median(distances(found, curve)) < 0.5
+    assert len(found) > 0.8 * np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
+
+
+def test_noise_alone_gives_no_strand():
+    lines, _, _ = traced(scan([straight((8, 8, 8), (8, 8, 56))], (64, 64, 64), snr=4.0))
+    assert len(lines) == 1
+
+
+def test_threads_change_nothing():
+    generator = np.random.default_rng(5)
+    curves = [straight(generator.uniform(4, 60, 3), generator.uniform(4, 60, 3)) for _ in range(25)]
+    volume = scan(curves, (64, 64, 64), snr=4.0)
+    many = traced(volume)[0]
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = traced(volume)[0]
+    finally:
+        numba.set_num_threads(threads)
+    assert len(one) == len(many) > 10
+    for a, b in zip(one, many, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_cancelling_passes_through():
+    volume = scan([straight((8, 8, 8), (8, 8, 56))], (64, 64, 64))
+    field = orientation_field(volume, 0.35 * PEAK)
+
+    def stop(done, total):
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        find_segments(volume, 0.35 * PEAK, field, GuideSettings(), 0, stop)
+
+
+def test_density_is_trilinear_across_bricks():
+    volume = scan([straight((8, 8, 8), (40, 30, 44))], (48, 48, 48))
+    points = np.random.default_rng(0).uniform(1, 46, (500, 3))
+    found = [density_at(volume.table, volume.bricks, *p) for p in points]
+    np.testing.assert_allclose(found, volume.sample(volume.to_scan(points)), atol=1e-3)
+    assert density_at(volume.table, volume.bricks, -1.0, 5.0, 5.0) == 0.0
+
+
+def test_centring_moves_onto_the_line():
+    volume = scan([straight((4, 20, 20), (44, 20, 20))], (48, 48, 48))
+    x, y, z = 24.0, 20.9, 19.4
+    for _ in range(3):
+        x, y, z, _ = centred(volume.table, volume.bricks, x, y, z, 1.0, 0.0, 0.0, 2, 0.7)
+    assert abs(y - 20) < 0.1 and abs(z - 20) < 0.1 and x == 24.0
+
+
+def test_a_strand_taken_out_leaves_nothing():
+    curve = straight((8, 20, 12), (40, 28, 36))
+    volume = scan([curve], (48, 48, 48))
+    add_strand(volume.table, volume.bricks, curve.astype(np.float32), np.full(len(curve), -PEAK), BLUR)
+    assert np.abs(volume.bricks).max() < 1e-3 * PEAK
+
+
+def test_smoothing_keeps_quadratics_and_tames_noise():
+    t = np.arange(60.0)
+    parabola = np.stack([t, 0.01 * t**2, 5 - 0.02 * t**2], 1).astype(np.float32)
+    widths = np.array([4, 8, 16], np.int64)
+    np.testing.assert_allclose(smoothed(parabola, widths, 0.3), parabola, atol=1e-3)
+    noisy = parabola + np.random.default_rng(0).normal(0, 0.15, parabola.shape).astype(np.float32)
+    assert np.std(smoothed(noisy, widths, 0.5) - parabola) < 0.6 * np.std(noisy - parabola)

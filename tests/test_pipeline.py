@@ -1,0 +1,131 @@
+"""The whole job on a small raw scan: outputs, resume after a kill in each stage, refusals that leave nothing behind."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+
+import numpy as np
+import pytest
+from ct2hair_addon.head import Head, load_obj, template_head
+
+from ct2hair_addon import cli, pipeline
+from ct2hair_addon.errors import Cancelled, CT2HairError, ScanError
+from ct2hair_addon.evaluation import evaluate, hairstyle, synthesize
+from ct2hair_addon.jobs import start
+from ct2hair_addon.settings import Settings
+from ct2hair_addon.strands import Strands
+
+SPACING = 0.9
+SETTINGS = Settings.preset("draft").changed({"head.face": "-y", "head.up": "+z"})
+
+
+@pytest.fixture(scope="session")
+def scan(tmp_path_factory):
+    """A raw scan of a bob of 1500 strands at 0.9 mm (fill 1215, as hard as the paper's)."""
+    path = tmp_path_factory.mktemp("scan") / "bob.vdb"
+    head = template_head()
+    synthesize(hairstyle("bob", head, 1500, 11), head, path, SPACING, snr=4.0, seed=11)
+    return path
+
+
+@pytest.fixture(scope="session")
+def result(scan, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    return out, pipeline.reconstruct(scan, out, SETTINGS)
+
+
+def test_the_result_folder_holds_what_it_should(result):
+    out, made = result
+    hair, guides = Strands.load(out / "hair.npz"), Strands.load(out / "guides.npz")
+    assert hair.points.dtype == np.float32 and hair.offsets.dtype == np.int64
+    for strands in (hair, guides):
+        assert strands.strand_attributes["root_uv"].shape == (len(strands), 2)
+        support = strands.strand_attributes["support"]
+        assert support.shape == (len(strands),) and support.min() >= 0 and support.max() <= 1
+    assert np.isfinite(hair.points).all() and hair.counts.min() >= 2
+    assert len(load_obj(out / "head.obj").vertices) == len(made.head.vertices)
+    report = json.loads((out / "report.json").read_text())
+    assert [stage["name"] for stage in report["stages"]] == list(pipeline.STAGES)
+    assert report["hair"]["strands"] == len(hair)
+    assert "<html" in (out / "report.html").read_text()[:500].lower()
+    assert (out / "volume.vdb").stat().st_size > 10_000
+
+
+def test_the_hair_is_rooted_outside_the_head_and_like_the_truth(result, scan):
+    out, made = result
+    hair, head = Strands.load(out / "hair.npz"), Head(made.head)
+    assert np.mean(head.closest_scalp(hair.roots).distance < 0.5) > 0.95
+    assert np.mean(head.signed_distance(hair.points) < -0.1) < 0.005
+    truth = Strands.load(scan.with_name("bob.strands.npz"))
+    scores = evaluate(truth, hair, None, voxels=(2.0,))
+    assert scores["strands"]["2/20"]["f"] > 0.6
+    assert scores["voxels"]["2.0"]["iou"] > 0.5
+
+
+def test_the_same_call_again_reuses_every_stage(result, scan):
+    out, _ = result
+    before = (out / "hair.npz").read_bytes()
+    again = pipeline.reconstruct(scan, out, SETTINGS)
+    assert all(stage["resumed"] for stage in again.report["stages"] if stage["name"] != "result")
+    assert (out / "hair.npz").read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_a_job_killed_in_each_stage_goes_on_and_ends_the_same_bit_for_bit(result, scan, tmp_path):
+    undisturbed = (result[0] / "hair.npz").read_bytes()
+    seen = []
+    for stage in (*pipeline.STAGES, None):
+        job = start(scan, tmp_path / "out", SETTINGS)
+        try:
+            while job.running:
+                messages = job.poll()
+                if stage and any(m.kind == "progress" and m.data["stage"] == stage for m in messages):
+                    job.process.send_signal(signal.SIGKILL)
+                    seen.append(stage)
+                    break
+            if stage is None:
+                assert job.wait(600) is not None, job.error
+        finally:
+            job.close()
+    assert seen == list(pipeline.STAGES)
+    assert (tmp_path / "out" / "hair.npz").read_bytes() == undisturbed
+
+
+def test_a_cancelled_run_keeps_its_finished_stages(result, scan, tmp_path):
+    class Impatient(pipeline.Silent):
+        def progressed(self, stage, fraction, total, remaining):
+            if stage == "guides":
+                raise Cancelled
+
+    with pytest.raises(Cancelled):
+        pipeline.reconstruct(scan, tmp_path / "out", SETTINGS, observer=Impatient())
+    assert sorted(p.name for p in (tmp_path / "out" / "checkpoints").iterdir()) == ["head.npz", "orientation.npz", "scan.npz"]
+    assert not (tmp_path / "out" / "hair.npz").exists()
+
+
+def test_a_scan_that_is_not_there_leaves_nothing(tmp_path):
+    with pytest.raises(ScanError, match=r"absent\.vdb"):
+        pipeline.reconstruct(tmp_path / "absent.vdb", tmp_path / "out", SETTINGS)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_real_head_without_hair_is_refused_and_leaves_nothing(shared_data, tmp_path, capsys):
+    scan = shared_data / "ct" / "CT_AVM.nii.gz"
+    assert cli.main(["reconstruct", str(scan), "--out", str(tmp_path / "out")]) == cli.REFUSED
+    assert "no hair" in capsys.readouterr().err.lower()
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_runs_do_not_share_a_folder(scan, tmp_path):
+    out = tmp_path / "out"
+    with pipeline._own_folder(out), pytest.raises(CT2HairError, match="another reconstruction"):
+        pipeline.reconstruct(scan, out, SETTINGS)
+
+
+def test_too_little_memory_is_said_before_the_long_stages(scan, tmp_path):
+    settings = SETTINGS.changed({"run.memory": 0.1})
+    with pytest.raises(CT2HairError, match="GB of memory"):
+        pipeline.reconstruct(scan, tmp_path / "out", settings)
