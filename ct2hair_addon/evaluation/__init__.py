@@ -1,19 +1,25 @@
 """Evaluation: hairstyles with known strands, scans made from them, scores of a result, and the report."""
 
 from .density import BLUR, render_density, strand_peak
+from .hairstyles import STYLES, hairstyle
+from .report import curvature, write_report
 from .scores import centre_line_error, coverage, evaluate, format_scores, orientation_error, scan_scores
 from .synthesis import Synthesis, synthesize
 
 __all__ = [
     "BLUR",
+    "STYLES",
     "Synthesis",
     "centre_line_error",
     "coverage",
+    "curvature",
     "evaluate",
     "format_scores",
+    "hairstyle",
     "orientation_error",
     "render_density",
     "scan_scores",
     "strand_peak",
     "synthesize",
+    "write_report",
 ]

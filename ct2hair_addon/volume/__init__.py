@@ -2,7 +2,22 @@
 
 from .grid import BRICK, BrickVolume
 from .readers import ScanReader, open_scan
+from .thresholds import Thresholds, find_thresholds
 from .vdb import load_vdb, save_vdb
+from .wig import WigScan, import_scan
 from .writers import ScanWriter, write_scan
 
-__all__ = ["BRICK", "BrickVolume", "ScanReader", "ScanWriter", "load_vdb", "open_scan", "save_vdb", "write_scan"]
+__all__ = [
+    "BRICK",
+    "BrickVolume",
+    "ScanReader",
+    "ScanWriter",
+    "Thresholds",
+    "WigScan",
+    "find_thresholds",
+    "import_scan",
+    "load_vdb",
+    "open_scan",
+    "save_vdb",
+    "write_scan",
+]

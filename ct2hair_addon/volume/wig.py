@@ -1,0 +1,586 @@
+"""The wig out of the scan: hair as sparse bricks, air and mannequin left out, knots and the mannequin's surface as points.
+
+Supplement 1, out of core: the scan is read once, slab by slab and ahead of the work, and only bricks with something
+strand-like in them are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from ..errors import ScanError
+from ..progress import Progress, silent
+from ..settings import ScanSettings
+from .grid import BRICK, BrickVolume
+from .readers import ScanReader
+from .resampling import CubicScan, cubic
+from .structure import (
+    BLOB_VARIANCE,
+    DIRECTIONS,
+    HALO,
+    LINE_SHARE,
+    MEAN_REACH,
+    NOISE_SHARE,
+    PERSISTS,
+    TAPS,
+    bump,
+    cut_block,
+    find_peaks,
+    local_mean,
+    smoothed,
+)
+from .thresholds import BELOW_NOISE, BLOCK, SOLID_VOLUME, Thresholds
+
+SLAB_BYTES = 192 * 2**20
+"""About what one slab takes as float32; three of them are in memory: one in work, one read ahead, one being read."""
+LEAST_VOXELS = 4
+"""Strand-like voxels in and just around a brick for it to be kept: fewer are noise."""
+MARGIN = 2
+"""Voxels around a brick that are looked at, too, so that a strand's flank beyond its brick is kept."""
+CLEAR = 3
+"""Voxels around the mannequin that are cleared with it: its blurred edge."""
+CONTRAST = 0.4
+"""A voxel is strand-like where the smoothed density exceeds the local mean by this share of a lone strand's smoothed peak."""
+CORE_MEAN = 0.4
+"""Inside a body the local mean, too, is above this share of its threshold; over a bundle of hair it is not."""
+KNOT_LINE = 55
+"""A blob keeps at most this share, percent, of its peak on both sides in its best direction."""
+BUMP = 0.6
+"""On the mannequin's skin a knot is a bump of at least this share of what a knot at the threshold makes."""
+MOST_KNOTS = 1024
+"""Knots noted in a block of 48^3 voxels."""
+ENOUGH_BUMPS = 500
+"""Knots on the mannequin's skin from which on no others are needed."""
+CELL = 4
+"""Voxels of a cell in which bodies are told apart."""
+MOST_SOLID = 200_000
+"""Points kept of the mannequin's surface."""
+
+
+@dataclass(frozen=True)
+class WigScan:
+    """A wig as later stages need it, in the scan frame.
+
+    density: BrickVolume float32, air at 0, the mannequin cleared to 0. hair_level: density above which a voxel is hair.
+    knots: (K, 3) float32 mm, blobs denser than strands: knots of the net, and some chance crossings of hair.
+    solid_points: (S, 3) float32 mm on the mannequin's outer surface; none without a mannequin. tally: what was kept and left
+    out. warnings: what was assumed.
+    """
+
+    density: BrickVolume
+    hair_level: float
+    knots: np.ndarray
+    solid_points: np.ndarray
+    thresholds: Thresholds
+    tally: dict[str, int]
+    warnings: tuple[str, ...] = ()
+
+
+def import_scan(
+    reader: ScanReader, thresholds: Thresholds, settings: ScanSettings | None = None, progress: Progress = silent
+) -> WigScan:
+    """The wig in a scan. Voxels that are no cubes are resampled to cubes. Raises ScanError where no hair is left."""
+    scan = cubic(reader)
+    levels = _Levels.of(thresholds)
+    size = [scan.shape[axis] for axis in scan.order]
+    table = np.full([-(-n // BRICK) for n in size], -1, np.int32)
+    core_table = table.copy()
+    bricks: list[np.ndarray] = []
+    cores: list[np.ndarray] = []
+    wanted: list[np.ndarray] = []
+    knots: list[np.ndarray] = []
+    bumps: list[np.ndarray] = []
+    stored = solid = hair_voxels = 0
+    for low, slab, before in _slabs(scan, progress):
+        found = _look(slab, before, low, size, levels)
+        knots.append(found.knots)
+        bumps.append(found.bumps)
+        rows = np.argwhere(found.flags > 0)
+        place = rows + [low // BRICK, 0, 0]
+        table[tuple(place.T)] = stored + np.arange(len(rows), dtype=np.int32)
+        stored += len(rows)
+        flags = found.flags[tuple(rows.T)]
+        wanted.append(flags & 1 > 0)
+        hair_voxels += int(found.hair)
+        values = np.empty((len(rows), BRICK, BRICK, BRICK), np.float32)
+        _cut_bricks(slab, rows, before, levels.air, values)
+        bricks.append(values)
+        dense = np.flatnonzero(flags & 2)
+        core_table[tuple(place[dense].T)] = solid + np.arange(len(dense), dtype=np.int32)
+        solid += len(dense)
+        cores.append(found.cores[tuple(rows[dense].T)])
+    values = np.concatenate(bricks) if bricks else np.zeros((0, BRICK, BRICK, BRICK), np.float32)
+    del bricks
+    core_rows = np.concatenate(cores) if cores else np.zeros((0, BRICK, BRICK), np.uint16)
+    keep = np.concatenate(wanted) if wanted else np.zeros(0, bool)
+    cell = float(scan.spacing[0])
+    body, volume = _bodies(core_table, core_rows, cell)
+    surface = np.zeros((0, 3))
+    cleared = 0
+    if volume > 0.0:
+        surface = _surface(core_table, body, size)
+        index = np.empty((len(values), 3), np.int32)
+        where = np.argwhere(table >= 0)
+        index[table[tuple(where.T)]] = where
+        clear = np.zeros(len(values), np.int64)
+        _clear(core_table, body, index, values, clear)
+        cleared = int(clear.sum())
+        inside = core_table[tuple(index.T)]
+        of_body = np.zeros(len(values), bool)
+        of_body[inside >= 0] = body[inside[inside >= 0]].any(axis=(1, 2))
+        # what is stored for its dense voxels alone stays where that was hair after all
+        keep |= (inside >= 0) & ~of_body
+        if sum(len(found) for found in bumps) >= ENOUGH_BUMPS:
+            # knots on the mannequin's skin are sure; blobs elsewhere are hair that crosses
+            knots = [np.zeros((0, 3), np.int32)]
+    else:
+        keep[:] = True
+    knots += bumps
+    table, values = _kept(table, values, keep)
+    density = _in_scan_axes(table, values, scan)
+    tally = {
+        "voxels of the scan": int(np.prod(scan.shape, dtype=np.int64)),
+        "strand-like voxels": hair_voxels,
+        "bricks kept": len(values),
+        "bricks left out: air": int(np.prod(table.shape)) - stored,
+        "bricks left out: mannequin": stored - len(values),
+        "voxels cleared: mannequin": cleared,
+        "knot points": sum(len(found) for found in knots),
+        "mannequin surface points": len(surface),
+        "voxels without a number, taken as air": scan.not_numbers,
+    }
+    if not len(values):
+        raise ScanError(
+            f"{scan.path}: no hair is left above air ({thresholds.air:.6g}) at the hair level {thresholds.hair:.6g}; "
+            "set scan.hair lower"
+        )
+    if thresholds.solid is not None and volume == 0.0:
+        where = f"no body of at least {SOLID_VOLUME / 1000:.0f} cm3 lies above scan.solid ({thresholds.solid:.6g})"
+        warnings = (*scan.warnings, f"{where}: the scan is taken as having no mannequin")
+    else:
+        warnings = tuple(scan.warnings)
+    axes = np.argsort(scan.order)
+    points = [
+        (np.asarray(found, np.float64)[:, axes] * cell + scan.origin).astype(np.float32)
+        for found in (np.concatenate(knots), surface)
+    ]
+    progress(1.0, 1.0)
+    return WigScan(density, float(thresholds.hair - thresholds.air), points[0], points[1], thresholds, tally, warnings)
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Densities above air: strand-like contrast, knots (smoothed), the mannequin's core; float32. solid is huge for none."""
+
+    air: np.float32
+    contrast: np.float32
+    knots: np.float32
+    solid: np.float32
+
+    @classmethod
+    def of(cls, thresholds: Thresholds) -> _Levels:
+        contrast = max(
+            CONTRAST * LINE_SHARE * thresholds.strand, 0.8 * BELOW_NOISE * NOISE_SHARE * thresholds.noise, 1e-30
+        )  # fmt: skip
+        if "hair" in thresholds.chosen:
+            contrast = LINE_SHARE * (thresholds.hair - thresholds.air)
+        knots = LINE_SHARE * (thresholds.knots - thresholds.air)
+        solid = thresholds.solid - thresholds.air if thresholds.solid is not None else 3e38
+        return cls(*(np.float32(value) for value in (thresholds.air, contrast, knots, solid)))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a slab holds. flags: (bricks) uint8, 1 strand-like, 2 dense core. cores: uint16 rows of core voxels. knots, bumps:
+    (K, 3) voxels of blobs in the hair and on the mannequin's skin. hair: strand-like voxels."""
+
+    flags: np.ndarray
+    cores: np.ndarray
+    knots: np.ndarray
+    bumps: np.ndarray
+    hair: int
+
+
+def _slabs(scan: ScanReader | CubicScan, progress: Progress) -> Iterator[tuple[int, np.ndarray, int]]:
+    """(first slice, slab with its halo, slices of halo before the first) one after another; the next are read meanwhile."""
+    depth = scan.shape[scan.order[0]]
+    plane = 4 * scan.shape[scan.order[1]] * scan.shape[scan.order[2]]
+    thick = max(SLAB_BYTES // (BLOCK * plane), 1) * BLOCK
+    starts = list(range(0, depth, thick))
+
+    def read(start: int) -> np.ndarray:
+        return scan.native(start, min(start + thick, depth))
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = [pool.submit(read, start) for start in starts[:2]]
+        try:
+            before = np.zeros((0, 0, 0), np.float32)
+            current = ahead.pop(0).result()
+            for number, start in enumerate(starts):
+                progress(start, depth)
+                if number + 2 < len(starts):
+                    ahead.append(pool.submit(read, starts[number + 2]))
+                following = ahead.pop(0).result() if number + 1 < len(starts) else None
+                parts = [
+                    part
+                    for part in (before, current, None if following is None else following[:HALO])
+                    if part is not None and len(part)
+                ]
+                yield start, np.concatenate(parts) if len(parts) > 1 else parts[0], len(before)
+                before, current = current[-HALO:].copy(), following
+        finally:
+            for waiting in ahead:
+                waiting.cancel()
+
+
+def _look(slab: np.ndarray, before: int, low: int, size, levels: _Levels) -> _Found:
+    """Flags, cores and knots of a slab, whose first `before` slices are halo."""
+    depth = min(slab.shape[0] - before, size[0] - low)
+    depth = min(depth, -(-depth // BLOCK) * BLOCK)
+    own = slab.shape[0] - before - (HALO if low + slab.shape[0] - before < size[0] else 0)
+    shape = [-(-own // BRICK), *(-(-n // BRICK) for n in slab.shape[1:])]
+    flags = np.zeros(shape, np.uint8)
+    cores = np.zeros((*shape, BRICK, BRICK), np.uint16) if levels.solid < 3e38 else np.zeros((0, 0, 0, BRICK, BRICK), np.uint16)
+    corners = np.stack(np.meshgrid(*(np.arange(0, n, BLOCK // BRICK) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    knots = np.empty((len(corners), MOST_KNOTS, 3), np.int32)
+    counts = np.zeros((len(corners), 3), np.int64)
+    _mark(
+        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, TAPS, DIRECTIONS, flags, cores, knots, counts
+    )  # fmt: skip
+    on_skin = np.concatenate([knots[n, :count] for n, count in enumerate(counts[:, 2])]) + [low, 0, 0]
+    in_hair = np.concatenate([knots[n, first:end] for n, (end, _, first) in enumerate(counts)]) + [low, 0, 0]
+    return _Found(flags, cores, in_hair, on_skin, int(counts[:, 1].sum()))
+
+
+@numba.njit(cache=True, parallel=True, nogil=True)
+def _mark(slab, before, own, corners, air, contrast, knots, solid, taps, directions, flags, cores, places, counts):
+    reach = MARGIN + CLEAR
+    for n in numba.prange(len(corners)):
+        low = corners[n] * BRICK
+        start = np.array([low[0] + before, low[1], low[2]])
+        block = np.empty((BLOCK + 2 * HALO, BLOCK + 2 * HALO, BLOCK + 2 * HALO), np.float32)
+        cut_block(slab, start, HALO, air, block)
+        smooth = smoothed(block, taps)  # 6 voxels more than the block on every side
+        mean = local_mean(block, MEAN_REACH)  # 5 voxels more
+        edge = HALO - 3 - reach
+        wide = BLOCK + 2 * reach
+        some = False
+        near = np.zeros((wide, wide, wide), np.bool_)
+        if solid < 3e38:
+            for i in range(wide):
+                for j in range(wide):
+                    for k in range(wide):
+                        if smooth[i + edge, j + edge, k + edge] > solid and mean[i, j, k] > CORE_MEAN * solid:
+                            near[i, j, k] = True
+                            some = True
+        if some:
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    for k in range(BLOCK):
+                        if near[i + reach, j + reach, k + reach]:
+                            I, J, K = corners[n, 0] + i // BRICK, corners[n, 1] + j // BRICK, corners[n, 2] + k // BRICK
+                            if I < flags.shape[0] and J < flags.shape[1] and K < flags.shape[2]:
+                                flags[I, J, K] |= 2
+                                cores[I, J, K, i % BRICK, j % BRICK] |= np.uint16(1) << np.uint16(k % BRICK)
+            _widen(near, CLEAR)
+            counts[n, 0] = counts[n, 2] = _bumps(
+                smooth, mean, near, reach, edge, solid, BUMP * knots / BLOB_VARIANCE, low, own, places[n]
+            )
+        found = np.zeros((BLOCK // BRICK, BLOCK // BRICK, BLOCK // BRICK), np.int64)
+        for i in range(CLEAR, wide - CLEAR):
+            for j in range(CLEAR, wide - CLEAR):
+                for k in range(CLEAR, wide - CLEAR):
+                    if smooth[i + edge, j + edge, k + edge] - mean[i, j, k] <= contrast or near[i, j, k]:
+                        continue
+                    a, b, c = i - reach, j - reach, k - reach
+                    if 0 <= a < BLOCK and 0 <= b < BLOCK and 0 <= c < BLOCK:
+                        counts[n, 1] += 1
+                    for I in range(max(a - MARGIN, 0) // BRICK, min(a + MARGIN, BLOCK - 1) // BRICK + 1):
+                        for J in range(max(b - MARGIN, 0) // BRICK, min(b + MARGIN, BLOCK - 1) // BRICK + 1):
+                            for K in range(max(c - MARGIN, 0) // BRICK, min(c + MARGIN, BLOCK - 1) // BRICK + 1):
+                                found[I, J, K] += 1
+        for a in range(found.shape[0]):
+            for b in range(found.shape[1]):
+                for c in range(found.shape[2]):
+                    I, J, K = corners[n, 0] + a, corners[n, 1] + b, corners[n, 2] + c
+                    if found[a, b, c] >= LEAST_VOXELS and I < flags.shape[0] and J < flags.shape[1] and K < flags.shape[2]:
+                        flags[I, J, K] |= 1
+        place = np.empty((8 * MOST_KNOTS, 3), np.int16)
+        value = np.empty((8 * MOST_KNOTS, 2), np.float32)
+        goes_on = np.empty((8 * MOST_KNOTS, 2), np.int16)
+        inner = mean[reach : reach + BLOCK, reach : reach + BLOCK, reach : reach + BLOCK]
+        peaks = find_peaks(smooth, inner, HALO - 3, 0.5 * knots, directions, PERSISTS, place, value, goes_on)
+        for p in range(peaks):
+            i, j, k = place[p, 0], place[p, 1], place[p, 2]
+            if value[p, 0] <= knots or goes_on[p, 1] > KNOT_LINE or near[i + reach, j + reach, k + reach]:
+                continue
+            if low[0] + i >= own or counts[n, 0] == MOST_KNOTS:
+                continue
+            places[n, counts[n, 0], 0], places[n, counts[n, 0], 1], places[n, counts[n, 0], 2] = (
+                low[0] + i,
+                low[1] + j,
+                low[2] + k,
+            )
+            counts[n, 0] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _bumps(smooth, mean, near, reach, edge, solid, least, low, own, places):
+    """Note the knots on the mannequin's skin, the block's strongest bumps in its band; returns how many."""
+    size = BLOCK + 2
+    height = np.zeros((size, size, size), np.float32)
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
+                a, b, c = i - 1 + reach, j - 1 + reach, k - 1 + reach
+                if near[a, b, c] and smooth[a + edge, b + edge, c + edge] > 0.1 * solid:
+                    height[i, j, k] = bump(smooth, a + edge, b + edge, c + edge)
+    count = 0
+    for i in range(1, size - 1):
+        for j in range(1, size - 1):
+            for k in range(1, size - 1):
+                here = height[i, j, k]
+                if here < least or low[0] + i - 1 >= own or count == len(places):
+                    continue
+                highest = True
+                for a in range(-1, 2):
+                    for b in range(-1, 2):
+                        for c in range(-1, 2):
+                            if height[i + a, j + b, k + c] > here:
+                                highest = False
+                if highest:
+                    places[count, 0], places[count, 1], places[count, 2] = low[0] + i - 1, low[1] + j - 1, low[2] + k - 1
+                    count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _widen(mask, reach):
+    """Grow a mask by a cube of `reach` voxels, in place."""
+    size = mask.shape[0]
+    line = np.empty(size, np.bool_)
+    for axis in range(3):
+        for i in range(size):
+            for j in range(size):
+                last = -reach - 1
+                for k in range(size):
+                    line[k] = mask[k, i, j] if axis == 0 else mask[i, k, j] if axis == 1 else mask[i, j, k]
+                for k in range(size + reach):
+                    if k < size and line[k]:
+                        last = k
+                    at = k - reach
+                    if at >= 0 and last >= at - reach:
+                        if axis == 0:
+                            mask[at, i, j] = True
+                        elif axis == 1:
+                            mask[i, at, j] = True
+                        else:
+                            mask[i, j, at] = True
+
+
+@numba.njit(cache=True, parallel=True, nogil=True)
+def _cut_bricks(slab, rows, before, air, out):
+    for n in numba.prange(len(rows)):
+        start = np.array([rows[n, 0] * BRICK + before, rows[n, 1] * BRICK, rows[n, 2] * BRICK])
+        cut_block(slab, start, 0, air, out[n])
+
+
+def _bodies(core_table: np.ndarray, core_rows: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
+    """((C, 16, 16) uint16 rows of the core voxels that belong to large bodies, their volume in mm^3)."""
+    if not len(core_rows):
+        return core_rows, 0.0
+    per_brick = BRICK // CELL
+    cells = np.zeros((len(core_rows), per_brick, per_brick, per_brick), np.int16)
+    _count_cells(core_rows, cells)
+    where = np.argwhere(core_table >= 0)
+    rows = core_table[tuple(where.T)]
+    low, high = where.min(axis=0), where.max(axis=0) + 1
+    grid = np.zeros([*(per_brick * (high - low))], bool)
+    spread = grid.reshape(high[0] - low[0], per_brick, high[1] - low[1], per_brick, high[2] - low[2], per_brick)
+    at = where - low
+    spread[at[:, 0], :, at[:, 1], :, at[:, 2], :] = cells[rows] > CELL**3 // 8
+    label, count = ndimage.label(grid, np.ones((3, 3, 3)))
+    labels = label.reshape(spread.shape)[at[:, 0], :, at[:, 1], :, at[:, 2], :]
+    volume = np.bincount(labels.ravel(), cells[rows].ravel(), count + 1) * spacing**3
+    large = volume >= SOLID_VOLUME
+    large[0] = False
+    body = np.zeros(cells.shape, bool)
+    body[rows] = large[labels]
+    # cells that hold only a rim of the body
+    near = np.zeros(grid.shape, bool)
+    near_spread = near.reshape(spread.shape)
+    near_spread[at[:, 0], :, at[:, 1], :, at[:, 2], :] = body[rows]
+    near = ndimage.binary_dilation(near, np.ones((3, 3, 3)))
+    body[rows] = near.reshape(spread.shape)[at[:, 0], :, at[:, 1], :, at[:, 2], :] & ((labels == 0) | large[labels])
+    kept = core_rows.copy()
+    _only_cells(kept, body)
+    return kept, float(volume[large].sum())
+
+
+@numba.njit(cache=True, parallel=True)
+def _count_cells(rows, cells):
+    for n in numba.prange(len(rows)):
+        for i in range(BRICK):
+            for j in range(BRICK):
+                for k in range(BRICK):
+                    if (rows[n, i, j] >> np.uint16(k)) & 1:
+                        cells[n, i // CELL, j // CELL, k // CELL] += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _only_cells(rows, kept):
+    for n in numba.prange(len(rows)):
+        for i in range(BRICK):
+            for j in range(BRICK):
+                mask = 0
+                for c in range(BRICK // CELL):
+                    if kept[n, i // CELL, j // CELL, c]:
+                        mask |= ((1 << CELL) - 1) << (CELL * c)
+                rows[n, i, j] &= np.uint16(mask)
+
+
+@numba.njit(cache=True, inline="always")
+def _row(table, rows, i, j, K):
+    """16 core bits of the voxels (i, j) of brick layer K; 0 where there are none."""
+    if i < 0 or j < 0 or K < 0:
+        return np.uint64(0)
+    I, J = i // BRICK, j // BRICK
+    if I >= table.shape[0] or J >= table.shape[1] or K >= table.shape[2]:
+        return np.uint64(0)
+    at = table[I, J, K]
+    return np.uint64(rows[at, i % BRICK, j % BRICK]) if at >= 0 else np.uint64(0)
+
+
+@numba.njit(cache=True, parallel=True)
+def _clear(table, rows, index, bricks, cleared):
+    """Set the voxels within CLEAR of a body's core to 0; counts them per brick."""
+    for n in numba.prange(len(bricks)):
+        K = index[n, 2]
+        for i in range(BRICK):
+            for j in range(BRICK):
+                near = np.uint64(0)
+                for a in range(-CLEAR, CLEAR + 1):
+                    for b in range(-CLEAR, CLEAR + 1):
+                        left = CLEAR * CLEAR - a * a - b * b
+                        if left < 0:
+                            continue
+                        x, y = BRICK * index[n, 0] + i + a, BRICK * index[n, 1] + j + b
+                        # bit CLEAR is the brick's first voxel
+                        line = _row(table, rows, x, y, K) << np.uint64(CLEAR)
+                        line |= _row(table, rows, x, y, K - 1) >> np.uint64(BRICK - CLEAR)
+                        line |= (_row(table, rows, x, y, K + 1) & np.uint64((1 << CLEAR) - 1)) << np.uint64(BRICK + CLEAR)
+                        if line:
+                            reach = int(np.sqrt(left))
+                            near |= line
+                            for c in range(1, reach + 1):
+                                near |= (line << np.uint64(c)) | (line >> np.uint64(c))
+                near >>= np.uint64(CLEAR)
+                if near:
+                    for k in range(BRICK):
+                        if (near >> np.uint64(k)) & np.uint64(1):
+                            bricks[n, i, j, k] = 0.0
+                            cleared[n] += 1
+
+
+def _surface(table: np.ndarray, rows: np.ndarray, size) -> np.ndarray:
+    """(S, 3) voxels on the outer surface of bodies, a shell's inner one and cuts by the scan's border left out."""
+    where = np.argwhere(table >= 0).astype(np.int64)
+    total = int(sum(int(np.bitwise_count(part).sum()) if hasattr(np, "bitwise_count") else _bits(part) for part in (rows,)))
+    every = max(total // (40 * MOST_SOLID), 1)
+    points, normals, count = _border(table, rows, where, np.array(size, np.int64), every)
+    points, normals = points[:count], normals[:count]
+    if not count:
+        return np.zeros((0, 3))
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    points = points[((points - centre) * normals).sum(axis=1) > 0.0]
+    if len(points) > MOST_SOLID:
+        points = points[np.linspace(0, len(points) - 1, MOST_SOLID).astype(np.int64)]
+    return points.astype(np.float64)
+
+
+def _bits(rows: np.ndarray) -> int:
+    return int(np.unpackbits(np.ascontiguousarray(rows).view(np.uint8)).sum())
+
+
+@numba.njit(cache=True, inline="always")
+def _is_core(table, rows, i, j, k):
+    if k < 0 or k // BRICK >= table.shape[2]:
+        return False
+    return (_row(table, rows, i, j, k // BRICK) >> np.uint64(k % BRICK)) & np.uint64(1) > 0
+
+
+@numba.njit(cache=True)
+def _border(table, rows, where, size, every):
+    """Core voxels with a free neighbour, thinned by `every`, and the direction in which the body ends there."""
+    room = 4096
+    points, normals = np.empty((room, 3), np.float32), np.empty((room, 3), np.float32)
+    count = seen = 0
+    for n in range(len(where)):
+        for i in range(BRICK):
+            for j in range(BRICK):
+                row = rows[table[where[n, 0], where[n, 1], where[n, 2]], i, j]
+                if row == 0:
+                    continue
+                for k in range(BRICK):
+                    if not (row >> np.uint16(k)) & 1:
+                        continue
+                    x, y, z = BRICK * where[n, 0] + i, BRICK * where[n, 1] + j, BRICK * where[n, 2] + k
+                    if min(x, y, z) < 2 or x > size[0] - 3 or y > size[1] - 3 or z > size[2] - 3:
+                        continue
+                    free = (
+                        not _is_core(table, rows, x - 1, y, z)
+                        or not _is_core(table, rows, x + 1, y, z)
+                        or not _is_core(table, rows, x, y - 1, z)
+                        or not _is_core(table, rows, x, y + 1, z)
+                        or not _is_core(table, rows, x, y, z - 1)
+                        or not _is_core(table, rows, x, y, z + 1)
+                    )
+                    if not free:
+                        continue
+                    seen += 1
+                    if seen % every:
+                        continue
+                    nx = ny = nz = 0.0
+                    for a in range(-2, 3):
+                        for b in range(-2, 3):
+                            for c in range(-2, 3):
+                                if not _is_core(table, rows, x + a, y + b, z + c):
+                                    nx, ny, nz = nx + a, ny + b, nz + c
+                    if count == room:
+                        room *= 2
+                        more_points, more_normals = np.empty((room, 3), np.float32), np.empty((room, 3), np.float32)
+                        more_points[:count], more_normals[:count] = points, normals
+                        points, normals = more_points, more_normals
+                    points[count, 0], points[count, 1], points[count, 2] = x, y, z
+                    normals[count, 0], normals[count, 1], normals[count, 2] = nx, ny, nz
+                    count += 1
+    return points, normals, count
+
+
+def _kept(table: np.ndarray, bricks: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The table and bricks of those to be kept; rows move down in place, since a second copy may not fit."""
+    number = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
+    table = np.where(table >= 0, number[table], -1).astype(np.int32)
+    chunk, at = 1024, 0
+    for start in range(0, len(bricks), chunk):
+        part = bricks[start : start + chunk][keep[start : start + chunk]]
+        bricks[at : at + len(part)] = part
+        at += len(part)
+    return table, bricks[:at]
+
+
+def _in_scan_axes(table: np.ndarray, bricks: np.ndarray, scan: ScanReader | CubicScan) -> BrickVolume:
+    """The volume with axes x, y, z from the file's own order."""
+    axes = tuple(int(n) for n in np.argsort(scan.order))
+    if axes != (0, 1, 2):
+        table = np.ascontiguousarray(table.transpose(axes))
+        for start in range(0, len(bricks), 1024):
+            part = bricks[start : start + 1024]
+            bricks[start : start + 1024] = part.transpose(0, *(1 + a for a in axes)).copy()
+    return BrickVolume(table, bricks, float(scan.spacing[0]), scan.origin)
