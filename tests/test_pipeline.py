@@ -8,11 +8,11 @@ import sys
 
 import numpy as np
 import pytest
-from ct2hair_addon.head import Head, load_obj, template_head
 
 from ct2hair_addon import cli, pipeline
 from ct2hair_addon.errors import Cancelled, CT2HairError, ScanError
 from ct2hair_addon.evaluation import evaluate, hairstyle, synthesize
+from ct2hair_addon.head import Head, load_obj, template_head
 from ct2hair_addon.jobs import start
 from ct2hair_addon.settings import Settings
 from ct2hair_addon.strands import Strands

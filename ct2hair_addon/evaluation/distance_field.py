@@ -18,7 +18,10 @@ _PER_CALL = 1 << 17
 
 @dataclass(frozen=True)
 class DistanceField:
-    """Signed distance (mm, negative inside) on a lattice. values: dense float32 [x, y, z]; step: mm; origin: (3,) mm of (0, 0, 0)."""
+    """Signed distance (mm, negative inside) on a lattice.
+
+    values: dense float32 [x, y, z]; step: mm; origin: (3,) mm of (0, 0, 0).
+    """
 
     values: np.ndarray
     step: float

@@ -34,7 +34,7 @@ VIEWS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """An orthographic view. axes (3, 3): rows right, up, forward, in the scan frame; centre (3,) mm; half: half its width, mm."""
+    """An orthographic view. axes (3, 3): rows right, up, forward, in the scan frame; centre (3,), half (its half width): mm."""
 
     axes: np.ndarray
     centre: np.ndarray

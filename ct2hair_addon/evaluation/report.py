@@ -24,14 +24,15 @@ MAP_CELLS = 64
 BARS = 28
 
 _STYLE = """
-:root { color-scheme: light dark; --ink: #1c1d21; --dim: #62656e; --line: #d9dbe1; --card: #fff; --page: #f4f5f7; --accent: #c8641e;
-  --second: #2b7fb8; }
+:root { color-scheme: light dark; --ink: #1c1d21; --dim: #62656e; --line: #d9dbe1; --card: #fff; --page: #f4f5f7;
+  --accent: #c8641e; --second: #2b7fb8; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e7e8ec; --dim: #9a9da8; --line: #33353c; --card: #202126;
   --page: #17181b; --accent: #ff9a4d; --second: #5cb8f0; } }
 body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
 main { max-width: 1080px; margin: 0 auto; padding: 28px 20px 60px; }
 h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 34px 0 10px; } p { margin: 6px 0; }
-.dim { color: var(--dim); } .warn { border-left: 4px solid var(--accent); padding: 4px 12px; background: var(--card); margin: 6px 0; }
+.dim { color: var(--dim); }
+.warn { border-left: 4px solid var(--accent); padding: 4px 12px; background: var(--card); margin: 6px 0; }
 .facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px; margin-top: 16px; }
 .facts div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px 12px; }
 .facts b { display: block; font-size: 20px; } table { border-collapse: collapse; width: 100%; background: var(--card); }

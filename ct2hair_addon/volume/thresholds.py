@@ -299,7 +299,10 @@ def _look(slab, corners, air, least, taps, directions, persists, value, goes_on,
 
 
 def _solid_level(means: np.ndarray, air: float, strand: float, volume: float) -> float | None:
-    """From (local mean, smoothed) pairs: the value half way from air to the mannequin's material; None where no large body of `volume` mm^3 is that dense."""
+    """The value half way from air to the mannequin's material, from pairs (local mean, smoothed); None without one.
+
+    volume: mm^3 of the scan. A mannequin is a body of at least SOLID_VOLUME, denser than hair is anywhere over a while.
+    """
     dense = means[means[:, 0] > SOLID_SHARE * strand, 1]
     if volume * len(dense) / max(len(means), 1) < SOLID_VOLUME:
         return None

@@ -251,7 +251,8 @@ def _look(slab: np.ndarray, before: int, low: int, size, levels: _Levels) -> _Fo
     knots = np.empty((len(corners), MOST_KNOTS, 3), np.int32)
     counts = np.zeros((len(corners), 3), np.int64)
     _mark(
-        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, TAPS, DIRECTIONS, flags, cores, knots, counts
+        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, TAPS, DIRECTIONS, flags, cores,
+        knots, counts,
     )  # fmt: skip
     on_skin = np.concatenate([knots[n, :count] for n, count in enumerate(counts[:, 2])]) + [low, 0, 0]
     in_hair = np.concatenate([knots[n, first:end] for n, (end, _, first) in enumerate(counts)]) + [low, 0, 0]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...strands import Strands
-from .growth import clump, cut, curl, grow, settle
-from .person import Person, Wisps, strands_of, unit_rows, wisps
+from .growth import clump, curl, cut, grow, settle
+from .person import Person, strands_of, unit_rows, wisps
 
 WISPS, LOCKS = 170, 1100
 """Wisps of the large and the small kind, at most: some 20 and 8 mm wide at the scalp."""
@@ -23,8 +23,8 @@ class Growth:
 
     start, comb: (N, 3) unit: first direction, and where it is combed to over comb_length. gravity: 1/mm: how fast hair
     turns down, from gravity_length on. length; layer: height over the skin that it lies at; tip (N, 3), tip_length: a turn of
-    the ends. sway (1/mm), sway_length: a wisp's own bends; stray: a strand's own, as a share. wisp, lock: 0 to 1, how far the two kinds of wisps close at
-    the tips. radius, wavelength, flat, ramp: curls (radius 0: none), own_phase: how much a strand's phase differs from its
+    the ends. sway (1/mm), sway_length: a wisp's own bends; stray: a strand's own, as a share. wisp, lock: 0 to 1, how far the
+    two kinds of wisps close at the tips. radius, wavelength, flat, ramp: curls (radius 0: none), own_phase: how much a strand's phase differs from its
     wisp's. lowest: z of the cut; shortest: mm kept at least. points: of each strand.
     """
 
