@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from ..head import Head
-from ..orientation import OrientationField
 from ..progress import Progress, part, silent
 from ..settings import GuideSettings
 from ..strands import Strands
@@ -22,6 +22,14 @@ PROFILED = 8000
 """Candidates that the strand's profile is measured on."""
 COARSEST = 1.0
 """mm; points of a guide are at most this far apart, or two voxels where that is less."""
+
+
+class HairField(Protocol):
+    """What tracing needs of the orientation field: `direction` int8 (B, 16, 16, 16, 3), unit * 127, and `confidence` uint8
+    (B, 16, 16, 16), above 0 where there is hair, in the density's bricks."""
+
+    direction: BrickVolume
+    confidence: BrickVolume
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Guides:
 def find_segments(
     density: BrickVolume,
     hair_level: float,
-    field: OrientationField,
+    field: HairField,
     settings: GuideSettings,
     seed: int,
     progress: Progress = silent,
@@ -60,7 +68,7 @@ def find_segments(
 def trace_guides(
     density: BrickVolume,
     hair_level: float,
-    field: OrientationField,
+    field: HairField,
     head: Head,
     settings: GuideSettings | None = None,
     seed: int = 0,

@@ -24,7 +24,8 @@ class Growth:
     start, comb: (N, 3) unit: first direction, and where it is combed to over comb_length. gravity: 1/mm: how fast hair
     turns down, from gravity_length on. length; layer: height over the skin that it lies at; tip (N, 3), tip_length: a turn of
     the ends. sway (1/mm), sway_length: a wisp's own bends; stray: a strand's own, as a share. wisp, lock: 0 to 1, how far the
-    two kinds of wisps close at the tips. radius, wavelength, flat, ramp: curls (radius 0: none), own_phase: how much a strand's phase differs from its
+    two kinds of wisps close at the tips. radius, wavelength, flat, ramp: curls (radius 0: none), own_phase: how much a strand's
+    phase differs from its
     wisp's. lowest: z of the cut; shortest: mm kept at least. points: of each strand.
     """
 
