@@ -73,6 +73,7 @@ class GuideSettings:
     scalp_angle: float = parameter(
         75.0, "largest angle to the scalp's normal at a root (tau_a)", unit="degrees", low=1.0, high=90.0
     )
+    link: bool = parameter(True, "segments are joined into whole strands before they are grown")
     min_support: float = parameter(
         0.15, "a strand of which less than this share was traced in the scan is dropped", low=0.0, high=1.0
     )
@@ -247,6 +248,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "orientation.sigma": 0.0,
         "orientation.reweighting": 1,
+        "guides.link": False,
         "interpolation.strands": 100_000,
         "interpolation.farthest": 6.0,
         "interpolation.texture": 2048,

@@ -60,8 +60,8 @@ def test_the_hair_is_rooted_outside_the_head_and_like_the_truth(result, scan):
     assert np.mean(head.signed_distance(hair.points) < -0.1) < 0.005
     truth = Strands.load(scan.with_name("bob.strands.npz"))
     scores = evaluate(truth, hair, None, voxels=(2.0,))
-    assert scores["strands"]["2/20"]["f"] > 0.6
-    assert scores["voxels"]["2.0"]["iou"] > 0.5
+    assert scores["strand"]["2/20"]["f"] > 0.6
+    assert scores["voxel"]["2"]["iou"] > 0.5
 
 
 def test_the_same_call_again_reuses_every_stage(result, scan):

@@ -14,6 +14,7 @@ from ..strands import Strands
 from ..volume.grid import BrickVolume
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
+from .linking import link_segments
 from .profile import StrandProfile, strand_profile
 from .seeds import seed_order, seed_voxels
 from .trace import trace_segments
@@ -83,29 +84,45 @@ def trace_guides(
     """
     settings = settings or GuideSettings()
     segments, profile, tally = find_segments(density, hair_level, field, settings, seed, part(progress, 0.0, 0.85))
-    strands, more = root_segments(segments, density.spacing, head, settings, part(progress, 0.85, 1.0))
+    strands, more = root_segments(
+        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen
+    )
     progress(1, 1)
     return Guides(strands, profile, tally | more)
 
 
 def root_segments(
-    segments: Strands, spacing: float, head: Head, settings: GuideSettings, progress: Progress = silent
+    segments: Strands,
+    spacing: float,
+    head: Head,
+    settings: GuideSettings,
+    progress: Progress = silent,
+    scan: BrickVolume | None = None,
+    strand: float = 0.0,
 ) -> tuple[Strands, dict[str, int]]:
-    """Directed and rooted strands from undirected segments (mm): Algorithm 1, growing, roots; and what became of them."""
+    """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; and what became of them.
+
+    scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
+    """
     tally: dict[str, int] = {}
-    traced = segments.lengths()
     fine = fine_ends(segments, head, settings)
     progress(0.1, 1.0)
     value = signs(segments, fine, head, settings)
-    progress(0.4, 1.0)
+    progress(0.3, 1.0)
     directed = segments.reversed(value < 0)
     tally["fine segments"] = int((fine != 0).sum())
     tally["poor segments"] = int((fine == 0).sum())
     tally["poor segments without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
-    bodies, reached, grown = grow_to_root(directed.resampled_by_step(_step(spacing)), fine != 0, settings)
+    rooted = fine != 0
+    bridged = np.zeros(len(directed), np.float32)
+    if scan is not None and settings.link:
+        directed, rooted, bridged, joints = link_segments(directed, rooted, scan, strand, part(progress, 0.3, 0.5))
+        tally |= joints
+    traced = directed.lengths() - bridged
+    bodies, reached, grown = grow_to_root(directed.resampled_by_step(_step(spacing)), rooted, settings)
     progress(0.7, 1.0)
     tally["dropped: no rooted hair near"] = int((~reached).sum())
-    backed = traced / np.maximum(traced + grown, 1e-6)
+    backed = traced / np.maximum(traced + bridged + grown, 1e-6)
     enough = reached & (backed >= settings.min_support)
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
