@@ -153,13 +153,20 @@ class _Job:
         guides = self._guides(density, level, head)
 
         def fill(progress: Progress) -> Dense:
-            count = settings.interpolation.strands or estimate_strand_count(density, level, guides.strands, head)
+            count = settings.interpolation.strands
+            if not count:
+                # a surplus of guides is left to the refinement, which sees strand by strand what the scan holds
+                count = max(estimate_strand_count(density, level, guides.strands, head), len(guides.strands))
             return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
 
         dense = self._stage("dense", fill)
+        # who asks for a number of strands gets that number
+        wanted = dataclasses.replace(
+            settings.refinement, prune=settings.refinement.prune and not settings.interpolation.strands
+        )
         refined = self._stage(
             "refinement",
-            lambda progress: refine(dense.strands, density, level, head, settings.refinement, seed, progress=progress),
+            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress),
         )
         tallies = {
             "scan": wig.tally,

@@ -118,6 +118,9 @@ class RefinementSettings:
     )
     iterations: int = parameter(60, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
     points: int = parameter(64, "control points of each strand at most", low=8, high=256)
+    prune: bool = parameter(
+        True, "volume: strands and tips that explain nothing of the scan go, so that the scan tells how many there are"
+    )
     coarsest: float = parameter(
         1.6, "volume: largest voxel of the coarse-to-fine search: how far strands are drawn", unit="mm", low=0.01, high=20.0
     )

@@ -1,4 +1,4 @@
-"""Segments joined into whole strands: which tip goes on in which root end, for all of them at once (in place of 3.2.2's clusters).
+"""Segments joined into whole strands: which tip goes on in which root end, for all of them at once (in place of 3.2.2).
 
 A trace ends where strands touch and goes on, under another name, where they part. Every tip end is held against the root
 ends that lie on its course; a joint costs what it bends more than hair does, what it bridges, and what the scan doesn't back.
@@ -90,14 +90,14 @@ def link_segments(
 
 
 def _courses(lines: Strands, from_root: bool, cut: float, voxel: float):
-    """(valid (N,), index (N,) of the end point, place, tangent, bend): the course of each strand as it leaves its end, in voxels.
+    """(valid (N,), place, tangent, bend (N, 3)): the course of each strand as it leaves its end, in voxels.
 
     A parabola is fitted to SPAN voxels before the end (for root ends: after it); tangent and bend (second derivative) are
     those along the outward direction.
     """
     counts = lines.counts
-    skip = int(round(cut / STEP))
-    window = int(round(SPAN / STEP))
+    skip = round(cut / STEP)
+    window = round(SPAN / STEP)
     valid = counts > max(skip + 4, 2 * skip)
     index = np.where(valid, (lines.offsets[:-1] + skip) if from_root else (lines.offsets[1:] - 1 - skip), lines.offsets[:-1])
     place = np.zeros((len(lines), 3))
@@ -106,7 +106,7 @@ def _courses(lines: Strands, from_root: bool, cut: float, voxel: float):
     _fit_ends(
         lines.points, lines.offsets, index, 1 if from_root else -1, window, STEP * voxel, valid, place, tangent, bend
     )  # fmt: skip
-    return valid, index, place / voxel, tangent, bend * voxel
+    return valid, place / voxel, tangent, bend * voxel
 
 
 @numba.njit(cache=True, parallel=True)
@@ -151,7 +151,7 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
 def _candidates(lines: Strands, rooted: np.ndarray, density: BrickVolume, strand: float, progress: Progress) -> _Joints:
     """All joints worth weighing, the cheapest for each pair."""
     voxel = density.spacing
-    root_valid, _, root_place, root_out, root_bend = _courses(lines, True, 0.0, voxel)
+    root_valid, root_place, root_out, root_bend = _courses(lines, True, 0.0, voxel)
     targets = np.flatnonzero(root_valid & ~rooted)
     nothing = _Joints(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     if not len(targets):
@@ -160,7 +160,7 @@ def _candidates(lines: Strands, rooted: np.ndarray, density: BrickVolume, strand
     found = []
     for number, cut in enumerate(CUTS):
         progress(0.7 * number / len(CUTS), 1.0)
-        valid, index, place, out, bend = _courses(lines, False, cut, voxel)
+        valid, place, out, bend = _courses(lines, False, cut, voxel)
         tips = np.flatnonzero(valid)
         if not len(tips):
             continue
@@ -183,7 +183,7 @@ def _candidates(lines: Strands, rooted: np.ndarray, density: BrickVolume, strand
         )  # fmt: skip
         cost += PER_CUT * cut
         kept = cost < LOOSE_END
-        shift = np.full(int(kept.sum()), int(round(cut / STEP)), np.int64)
+        shift = np.full(int(kept.sum()), round(cut / STEP), np.int64)
         found.append((tip[kept], root[kept], shift, cost[kept]))
     if not found:
         return nothing
@@ -308,7 +308,6 @@ def _chains(following: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _joined(lines: Strands, following, cut, chain, position, length, voxel):
     """(points, offsets, bridged (C,) mm) of the chains: their segments in order, with a cubic Hermite piece in each gap."""
     order = np.lexsort((position, chain))
-    _, _, place, out, _ = _courses(lines, False, 0.0, voxel)
     tips = lines.offsets[1:] - 1 - cut
     roots = lines.offsets[:-1]
     linked = following[order] >= 0

@@ -8,13 +8,14 @@ import numpy as np
 
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
-from ..strands import Strands
+from ..strands import Strands, offsets_from_counts
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
 from .curves import control_points, polylines
 from .fit import fit_to_volume
+from .pruning import prune
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,19 @@ def refine(
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     points, offsets = control_points(kept, settings.points)
     first = (Strands(points, offsets), boundary.look(points))
-    if settings.iterations:
-        step = part(progress, 0.05, 0.9)
+    judged = settings.prune and settings.method == "volume"
+    if judged:
+        points, offsets, kept, counts = _pruned(points, offsets, kept, density, profile, boundary, part(progress, 0.05, 0.1))
+        tally |= {f"{name}, before fitting": count for name, count in counts.items()}
+    if settings.iterations and len(kept):
+        step = part(progress, 0.1, 0.85)
         points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, step)
         tally |= counts
+        if judged:
+            points, offsets, kept, counts = _pruned(
+                points, offsets, kept, density, profile, boundary, part(progress, 0.85, 0.9)
+            )
+            tally |= {f"{name}, after fitting": count for name, count in counts.items()}
     last = (Strands(points, offsets), boundary.look(points))
     before, after = agreements([first, last], density, profile, progress=part(progress, 0.9, 0.98))
     fine, fine_offsets = polylines(points, offsets)
@@ -74,6 +84,15 @@ def refine(
     result = _supported(Strands(cleared, fine_offsets, kept.strand_attributes), density, hair_level)
     progress(1.0, 1.0)
     return Refined(result, tally, {"before": before, "after": after})
+
+
+def _pruned(points, offsets, strands, density, profile, boundary, progress):
+    """Control points, offsets and strands without what explains nothing of the scan; and the counts of what went."""
+    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress)
+    first = np.repeat(offsets[:-1], np.diff(offsets))
+    points = points[np.arange(len(points)) - first < np.repeat(stay, np.diff(offsets))]
+    alive = stay > 0
+    return points, offsets_from_counts(stay[alive]), strands.select(alive), tally
 
 
 def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, progress):

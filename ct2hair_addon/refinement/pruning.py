@@ -1,0 +1,179 @@
+"""Strands taken away, whole or from the tip, where they explain nothing of the scan: the count comes from the scan.
+
+Removing a stretch of a strand changes half the squared misfit by the integral of `1/2 - a` along it, in units of a lone
+strand's energy, where `a` is how much of a strand is rendered there too many (the misfit's amplitude under a strand's
+profile): 0 where the strand is needed, 1 where it doubles another. What is best kept is the prefix from the root that
+earns most.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from ..progress import Progress, part, silent
+from ..volume import BrickVolume
+from ..volume.grid import trilinear
+from ..volume.strand_signal import StrandProfile, add_strand
+from .splat import CHUNK, cubic, render, segment_samples
+
+LEAST_EARNED = 8.0
+"""voxel; a strand that earns less than so much of a lone strand's length is left out."""
+LEAST_CUT = 6.0
+"""voxel; a tip is cut only where that earns as much."""
+RING = 1.0
+"""voxel; the misfit is read on the centre line and on four points this far from it."""
+
+
+def prune(
+    points: np.ndarray,
+    offsets: np.ndarray,
+    visible: np.ndarray,
+    density: BrickVolume,
+    profile: StrandProfile,
+    progress: Progress = silent,
+) -> tuple[np.ndarray, dict[str, int]]:
+    """(N,) int64: how many control points of each strand stay, 0 for none; and the counts of what went.
+
+    points (M, 3) mm, root first, offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. Strands are judged one after
+    another, those that earn least first, each against what the others before it have left; the same on any number of threads.
+    """
+    counts = np.diff(offsets)
+    kept = counts.copy()
+    if not len(counts):
+        return kept, {"strands removed: the scan has them already": 0, "tips cut back": 0}
+    voxels = density.to_voxel(points)
+    gain = profile.line_mass / density.spacing**2
+    excess = render(voxels, offsets, visible, density, profile.blur, part(progress, 0.0, 0.7))
+    for start in range(0, len(excess), CHUNK):
+        excess[start : start + CHUNK] *= np.float32(gain)
+        excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
+    peak = gain / (2.0 * np.pi * profile.blur**2)
+    # what trilinear reads see of a strand's profile on its line and on the ring
+    wide = profile.blur**2 + 1.0 / 6.0
+    seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * profile.blur**2 / wide
+    earned = np.empty(len(counts))
+    _earn(density.table, excess, voxels, offsets, visible, peak, seen, earned)
+    progress(0.8, 1.0)
+    order = np.argsort(earned, kind="stable")
+    step = 2000
+    for start in range(0, len(order), step):
+        progress(0.8 + 0.2 * start / len(order), 1.0)
+        _cut(
+            density.table, excess, voxels, offsets, visible, order[start : start + step], peak, seen, profile.blur, kept
+        )  # fmt: skip
+    progress(1.0, 1.0)
+    gone = int(np.count_nonzero((kept == 0) & (counts > 0)))
+    tally = {
+        "strands removed: the scan has them already": gone,
+        "tips cut back": int(np.count_nonzero((kept > 0) & (kept < counts))),
+    }
+    return kept, tally
+
+
+@numba.njit(cache=True, nogil=True)
+def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
+    """How many strands too many are rendered at a point of a strand with unit tangent t: least squares over five reads."""
+    if abs(tx) <= abs(ty) and abs(tx) <= abs(tz):
+        ux, uy, uz = 0.0, tz, -ty
+    elif abs(ty) <= abs(tz):
+        ux, uy, uz = -tz, 0.0, tx
+    else:
+        ux, uy, uz = ty, -tx, 0.0
+    norm = RING / max(np.sqrt(ux * ux + uy * uy + uz * uz), 1e-12)
+    ux, uy, uz = ux * norm, uy * norm, uz * norm
+    vx, vy, vz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
+    nothing = np.float32(0.0)
+    middle = trilinear(table, excess, nothing, x, y, z)
+    ring = trilinear(table, excess, nothing, x + ux, y + uy, z + uz)
+    ring += trilinear(table, excess, nothing, x - ux, y - uy, z - uz)
+    ring += trilinear(table, excess, nothing, x + vx, y + vy, z + vz)
+    ring += trilinear(table, excess, nothing, x - vx, y - vy, z - vz)
+    return (seen[0] * middle + seen[1] * ring) / (peak * (seen[0] ** 2 + 4.0 * seen[1] ** 2))
+
+
+@numba.njit(cache=True, nogil=True)
+def _prefix(table, excess, points, visible, start, end, peak, seen, earned):
+    """Fill `earned` (end - start,) with what the strand earns up to each of its control points."""
+    total = 0.0
+    earned[0] = 0.0
+    for m in range(start, end - 1):
+        first, last = m == start, m + 2 >= end
+        p0 = m if first else m - 1
+        p3 = m + 1 if last else m + 2
+        count = segment_samples(points, m)
+        px, py, pz = points[m, 0], points[m, 1], points[m, 2]
+        for s in range(count):
+            wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
+            qx = wa * points[p0, 0] + wb * points[m, 0] + wc * points[m + 1, 0] + wd * points[p3, 0]
+            qy = wa * points[p0, 1] + wb * points[m, 1] + wc * points[m + 1, 1] + wd * points[p3, 1]
+            qz = wa * points[p0, 2] + wb * points[m, 2] + wc * points[m + 1, 2] + wd * points[p3, 2]
+            tx, ty, tz = qx - px, qy - py, qz - pz
+            length = np.sqrt(tx * tx + ty * ty + tz * tz)
+            t = (s + 0.5) / count
+            shown = (1.0 - t) * visible[m] + t * visible[m + 1]
+            if length > 0.0 and shown > 0.0:
+                x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+                a = _amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
+                total += shown * length * (0.5 - min(max(a, -1.0), 2.0))
+            px, py, pz = qx, qy, qz
+        earned[m + 1 - start] = total
+
+
+@numba.njit(cache=True, parallel=True)
+def _earn(table, excess, points, offsets, visible, peak, seen, out):
+    for n in numba.prange(len(out)):
+        size = offsets[n + 1] - offsets[n]
+        out[n] = 0.0
+        if size > 1:
+            earned = np.empty(size)
+            _prefix(table, excess, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
+            out[n] = earned[size - 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _cut(table, excess, points, offsets, visible, order, peak, seen, blur, kept):
+    for n in order:
+        start, end = offsets[n], offsets[n + 1]
+        size = end - start
+        if size < 2:
+            continue
+        earned = np.empty(size)
+        _prefix(table, excess, points, visible, start, end, peak, seen, earned)
+        best = 0
+        for m in range(size):
+            if earned[m] > earned[best]:
+                best = m
+        if earned[best] < LEAST_EARNED:
+            stay = 0
+        elif earned[best] - earned[size - 1] >= LEAST_CUT and best + 1 < size:
+            stay = max(best + 1, 2)
+        else:
+            continue
+        kept[n] = stay
+        # what is cut no longer shows: take its profile out of the rendering
+        low = start + max(stay - 1, 0)
+        samples = 0
+        for m in range(low, end - 1):
+            samples += segment_samples(points, m)
+        path = np.empty((samples + 1, 3), np.float32)
+        amplitude = np.empty(samples + 1)
+        for axis in range(3):
+            path[0, axis] = points[low, axis]
+        amplitude[0] = -peak * visible[low]
+        at = 1
+        for m in range(low, end - 1):
+            first, last = m == start, m + 2 >= end
+            p0 = m if first else m - 1
+            p3 = m + 1 if last else m + 2
+            count = segment_samples(points, m)
+            for s in range(count):
+                wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
+                for axis in range(3):
+                    path[at, axis] = (
+                        wa * points[p0, axis] + wb * points[m, axis] + wc * points[m + 1, axis] + wd * points[p3, axis]
+                    )
+                t = (s + 1.0) / count
+                amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
+                at += 1
+        add_strand(table, excess, path, amplitude, blur)
