@@ -80,6 +80,10 @@ def _add_reconstruct(commands) -> None:
         short = SHORT_NAMES.get(name)
         option = short or "--" + name.replace(".", "-").replace("_", "-")
         unit = f" [{known.metadata['unit']}]" if known.metadata["unit"] else ""
+        text = f"{known.metadata['help']}{unit} (preset's value, {known.default!r} in standard)".replace("%", "%%")
+        if known.type == "bool":
+            parser.add_argument(option, dest=name, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
+            continue
         parser.add_argument(
             option,
             dest=name,
@@ -87,7 +91,7 @@ def _add_reconstruct(commands) -> None:
             choices=known.metadata["choices"] or None,
             default=argparse.SUPPRESS,
             metavar=None if known.metadata["choices"] else option.lstrip("-").split("-")[-1].upper(),
-            help=f"{known.metadata['help']}{unit} (preset's value, {known.default!r} in standard)".replace("%", "%%"),
+            help=text,
         )
 
 

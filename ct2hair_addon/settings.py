@@ -116,13 +116,13 @@ class RefinementSettings:
         "volume: all strands against the density itself; chamfer: the paper's, points of strands against points of the scan",
         choices=("volume", "chamfer"),
     )
-    iterations: int = parameter(60, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
+    iterations: int = parameter(40, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
     points: int = parameter(64, "control points of each strand at most", low=8, high=256)
     prune: bool = parameter(
         True, "volume: strands and tips that explain nothing of the scan go, so that the scan tells how many there are"
     )
     coarsest: float = parameter(
-        1.6, "volume: largest voxel of the coarse-to-fine search: how far strands are drawn", unit="mm", low=0.01, high=20.0
+        0.5, "volume: largest voxel of the coarse-to-fine search: how far strands are drawn", unit="mm", low=0.01, high=20.0
     )
     stiffness: float = parameter(3.0, "volume: shape is kept below about six times this length", unit="mm", low=0.0, high=100.0)
     rate: float = parameter(0.1, "chamfer: learning rate of Adam", unit="mm", low=1e-4, high=10.0)
