@@ -218,7 +218,9 @@ def _synthesize(chosen: argparse.Namespace) -> int:
         mannequin=not chosen.no_mannequin,
         net=not chosen.no_net,
     )
-    print(f"{len(strands)} strands, {' x '.join(map(str, made.shape))} voxels of {chosen.spacing} mm: {chosen.out}")
+    print(
+        f"{len(strands)} strands, {' x '.join(map(str, made.description['shape']))} voxels of {chosen.spacing} mm: {chosen.out}"
+    )
     return DONE
 
 

@@ -52,6 +52,11 @@ class HeadSettings:
 class OrientationSettings:
     """The 3D orientation field (paper 3.2.1, eqs. 1 and 2)."""
 
+    method: str = parameter(
+        "gradient",
+        "gradient: the direction across which density changes; gabor: the best of many oriented filters (the paper's ablation)",
+        choices=("gradient", "gabor"),
+    )
     sigma: float = parameter(0.7, "Gaussian under the density gradient", unit="voxel", low=0.0, high=3.0)
     rho: float = parameter(1.5, "Gaussian over which gradients are gathered", unit="voxel", low=0.5, high=5.0)
     reweighting: int = parameter(0, "steps of iterative reweighting against outliers", low=0, high=10)
@@ -62,6 +67,11 @@ class OrientationSettings:
 class GuideSettings:
     """Guide strands from the orientation field (paper 3.2.2, Algorithm 1, supplement 2)."""
 
+    method: str = parameter(
+        "trace",
+        "trace: strands followed through the density and taken out of it; paper: the paper's mean shift, Euler steps, growing",
+        choices=("trace", "paper"),
+    )
     step: float = parameter(1.0, "Euler step along a segment", unit="voxel", low=0.1, high=4.0)
     max_turn: float = parameter(30.0, "a segment ends where it would turn more in one step", unit="degrees", low=1.0, high=90.0)
     smoothing: float = parameter(
@@ -86,7 +96,17 @@ class GuideSettings:
 class InterpolationSettings:
     """Dense strands from the guides, over the scalp (paper 3.3.1, eq. 3)."""
 
-    strands: int = parameter(0, "strands of the result; 0 takes as many as the scan's density holds", low=0, high=1_000_000)
+    method: str = parameter(
+        "scalp",
+        "scalp: new roots evenly over the scalp, as many as asked for; texture: the paper's texels, drawn at random",
+        choices=("scalp", "texture"),
+    )
+    strands: int = parameter(
+        0,
+        "strands of the result; 0 takes as many as the scan's density holds; texture: texels drawn (N_i), 0 takes 100,000",
+        low=0,
+        high=1_000_000,
+    )
     neighbours: int = parameter(3, "guides that are blended into a new strand (k_i)", low=1, high=16)
     nearest: float = parameter(0.6, "no new strand closer to a guide than this (sigma_min)", unit="texel", low=0.0, high=100.0)
     farthest: float = parameter(
@@ -251,7 +271,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "orientation.sigma": 0.0,
         "orientation.reweighting": 1,
-        "guides.link": False,
+        "guides.method": "paper",
+        "interpolation.method": "texture",
         "interpolation.strands": 100_000,
         "interpolation.farthest": 6.0,
         "interpolation.texture": 2048,

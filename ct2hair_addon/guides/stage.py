@@ -15,6 +15,7 @@ from ..volume.grid import BrickVolume
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
 from .linking import link_segments
+from .paper import paper_guides
 from .profile import StrandProfile, strand_profile
 from .seeds import seed_order, seed_voxels
 from .trace import trace_segments
@@ -56,14 +57,19 @@ def find_segments(
 ) -> tuple[Strands, StrandProfile, dict[str, int]]:
     """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing."""
     voxels, directions, shuffle = seed_voxels(field.confidence, field.direction, seed)
-    chosen = np.argsort(shuffle, kind="stable")[:PROFILED]
-    axes = directions[chosen].astype(np.float64)
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    profile = strand_profile(density, hair_level, voxels[chosen], axes)
+    profile = _profile(density, hair_level, voxels, directions, shuffle)
     order = seed_order(density, voxels, directions, shuffle, profile, part(progress, 0.0, 0.15))
     residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
     found = trace_segments(residual, voxels, directions, order, profile, settings, part(progress, 0.15, 1.0))
     return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
+
+
+def _profile(density: BrickVolume, hair_level: float, voxels, directions, shuffle) -> StrandProfile:
+    """A lone strand's profile, measured on the first PROFILED of the shuffled seeds."""
+    chosen = np.argsort(shuffle, kind="stable")[:PROFILED]
+    axes = directions[chosen].astype(np.float64)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return strand_profile(density, hair_level, voxels[chosen], axes)
 
 
 def trace_guides(
@@ -79,10 +85,14 @@ def trace_guides(
 
     Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, the poor ones
     grown along rooted
-    neighbours, each root led into the scalp, no point left inside the head. The same seed gives the same strands, on any
-    number of threads.
+    neighbours, each root led into the scalp, no point left inside the head. With `settings.method` "paper" all of it goes the
+    paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
+    if settings.method == "paper":
+        strands, tally = paper_guides(density, field.direction, field.confidence, head, settings, seed, progress)
+        seeds = seed_voxels(field.confidence, field.direction, seed)
+        return Guides(strands, _profile(density, hair_level, *seeds), tally)
     segments, profile, tally = find_segments(density, hair_level, field, settings, seed, part(progress, 0.0, 0.85))
     strands, more = root_segments(
         segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen
