@@ -81,10 +81,12 @@ class Silent:
 class Reconstruction:
     """What `reconstruct` made: all in the scan frame, mm.
 
-    head_to_scan: 4 x 4, the head frame's place in the scan (rigid, with the template's scale). report: as in report.json.
+    dense: the strands before the refinement. head_to_scan: 4 x 4, the head frame's place in the scan (rigid, with the
+    template's scale). report: as in report.json.
     """
 
     hair: Strands
+    dense: Strands
     guides: Strands
     head: HeadMesh
     head_to_scan: np.ndarray
@@ -154,7 +156,7 @@ class _Job:
 
         def fill(progress: Progress) -> Dense:
             count = settings.interpolation.strands
-            if not count:
+            if not count and settings.interpolation.method == "scalp":
                 # a surplus of guides is left to the refinement, which sees strand by strand what the scan holds
                 count = max(estimate_strand_count(density, level, guides.strands, head), len(guides.strands))
             return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
@@ -175,7 +177,7 @@ class _Job:
             "dense": dense.tally,
             "refinement": refined.tally,
         }
-        return self._write(wig, registration, head, guides.strands, refined, tallies)
+        return self._write(wig, registration, head, guides.strands, dense.strands, refined, tallies)
 
     def _import(self, progress: Progress) -> WigScan:
         reader = open_scan(self.scan, self.settings.scan, **self.raw)
@@ -209,7 +211,9 @@ class _Job:
             )
         return guides
 
-    def _write(self, wig: WigScan, registration: Registration, head: Head, guides: Strands, refined: Refined, tallies):
+    def _write(
+        self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined, tallies
+    ) -> Reconstruction:
         """Write the result's files, each whole or not at all."""
         self.observer.started("result", TEXTS["result"])
         progress, meter = self._progress("result"), Meter()
@@ -256,7 +260,7 @@ class _Job:
         write_report(self.out, summary, wig.density, hair, guides, head, progress=part(progress, 0.3, 1.0))
         seconds = time.monotonic() - self.begun
         progress(1.0, 1.0)
-        return Reconstruction(hair, guides, registration.head, np.asarray(registration.matrix), summary, seconds)
+        return Reconstruction(hair, dense, guides, registration.head, np.asarray(registration.matrix), summary, seconds)
 
     def _template(self) -> HeadMesh:
         path = self.settings.head.mesh

@@ -3,7 +3,17 @@
 from .density import BLUR, render_density, strand_peak
 from .hairstyles import STYLES, hairstyle
 from .report import curvature, write_report
-from .scores import centre_line_error, coverage, evaluate, format_scores, orientation_error, scan_scores
+from .scores import (
+    centre_line_error,
+    coverage,
+    direction_share,
+    evaluate,
+    format_scores,
+    orientation_error,
+    registration_error,
+    rooted_length,
+    scan_scores,
+)
 from .synthesis import Synthesis, synthesize
 
 __all__ = [
@@ -13,11 +23,14 @@ __all__ = [
     "centre_line_error",
     "coverage",
     "curvature",
+    "direction_share",
     "evaluate",
     "format_scores",
     "hairstyle",
     "orientation_error",
+    "registration_error",
     "render_density",
+    "rooted_length",
     "scan_scores",
     "strand_peak",
     "synthesize",

@@ -52,6 +52,12 @@ INSIDE = 0.01
 QUERIES = 2_000_000
 """Points asked at most, in each direction."""
 
+DIRECTED = (2.0, 20.0)
+"""(mm, degrees) within which a true strand tells a result's direction from root to tip."""
+
+SCALP_POINTS = 4000
+"""Even points of each scalp that registration is measured at."""
+
 _LAYER_BYTES = 600e6
 """Bricks of a slab of one compared volume, roughly, where all of its box is hair."""
 
@@ -164,6 +170,50 @@ def head_scores(result: Strands, head: HeadMesh, queries: int = QUERIES) -> dict
     return {"roots_on_scalp": float(on_scalp.mean()), "inside_head": float((depth < -INSIDE).mean())}
 
 
+def direction_share(result: Strands, truth: Strands, queries: int = QUERIES) -> dict[str, float]:
+    """Share of the result's length, every millimetre, that runs root to tip as the truth does (`right`).
+
+    A point is asked of the nearest of its 16 nearest true points within 2 mm whose tangent lies within 20 degrees, sign
+    ignored; `compared` is the share of the length with one. FINDINGS.md and issue 4 give directions so.
+    """
+    true, found = _Samples(truth), _Samples(result)
+    which = _drawn((np.diff(found.offsets) + 1) // 2, queries)
+    asked = found.strands.select(which)
+    tangents = sample_tangents(asked, TANGENT_REACH)
+    points, tangents = asked.points[::2], tangents[::2]
+    right = compared = 0
+    for start in range(0, len(points), _PER_CALL):
+        some = slice(start, start + _PER_CALL)
+        index, _ = true.grid.nearest(points[some], NEIGHBOURS, DIRECTED[0])
+        cosine = np.einsum("mkc,mc->mk", true.tangents[np.maximum(index, 0)], tangents[some])
+        fits = (index >= 0) & (np.abs(cosine) >= math.cos(math.radians(DIRECTED[1])))
+        first = fits.argmax(axis=1)
+        rows = np.arange(len(first))
+        has = fits[rows, first]
+        compared += int(has.sum())
+        right += int((cosine[rows, first][has] > 0.0).sum())
+    return {"right": _ratio(right, compared), "compared": _ratio(compared, len(points))}
+
+
+def rooted_length(strands: Strands, head: HeadMesh) -> float:
+    """Share of the length that lies on strands whose first point is on the scalp (ROOT_REACH)."""
+    kept = strands.select(strands.counts > 0)
+    if not len(kept):
+        return 0.0
+    rooted = Head(head).closest_scalp(kept.roots).distance <= ROOT_REACH
+    lengths = kept.lengths().astype(np.float64)
+    return _ratio(lengths[rooted].sum(), lengths.sum())
+
+
+def registration_error(found: HeadMesh, true: HeadMesh) -> dict[str, float]:
+    """Distance (mm) from even points of the true scalp to the fitted one, one frame: median, 90th percentile; and
+    `beyond`, the same median from the fitted scalp to the true one, which grows where too much skin became scalp."""
+    fitted, truth = Head(found), Head(true)
+    there = fitted.closest_scalp(truth.sample_scalp(SCALP_POINTS, 0).position).distance
+    back = truth.closest_scalp(fitted.sample_scalp(SCALP_POINTS, 0).position).distance
+    return {**_spread(there), "beyond": float(np.median(back))}
+
+
 def orientation_error(points: np.ndarray, directions: np.ndarray, truth: Strands, reach: float = 2.0) -> dict[str, float]:
     """Degrees between directions (M, 3) at points (M, 3; mm) and the tangent of the nearest true strand, sign ignored.
 
@@ -256,7 +306,7 @@ class _Samples:
     """A strand set sampled for the strand scores: points every TARGET_STEP, their tangents, their strands, and a grid."""
 
     def __init__(self, strands: Strands) -> None:
-        samples = sample_curves(strands.select(strands.counts > 0), TARGET_STEP)
+        self.strands = samples = sample_curves(strands.select(strands.counts > 0), TARGET_STEP)
         self.points, self.offsets = samples.points, samples.offsets
         self.tangents = sample_tangents(samples, TANGENT_REACH)
         self.strand = samples.strand_index.astype(np.int32)

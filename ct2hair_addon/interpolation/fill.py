@@ -14,6 +14,7 @@ from ..strands import Strands, concatenate
 from ..volume import BrickVolume
 from ..volume.strand_signal import outward, support_along
 from .coder import Coder, EuclideanCoder, blend
+from .texture import SIDE, drawn_texels, eq3_weights, texels_of
 
 SHAPE_POINTS = 100
 """Points of a shape on its way through the coder: 3 mm apart on long hair, so that curls of a few mm come through."""
@@ -67,21 +68,28 @@ def fill_scalp(
     without them it is 0. coder: how strands are blended (`EuclideanCoder`). The same seed gives the same bits.
 
     New roots are blue noise on the scalp, not closer to a guide's root than `settings.nearest` nor farther than
-    `settings.farthest` texels (the latter gives way, and is counted, where `count` could not be reached).
+    `settings.farthest` texels (the latter gives way, and is counted, where `count` could not be reached). With
+    `settings.method` "texture" they are the paper's (`texture`): `count` texels are drawn (0: 100,000), those outside the two
+    distances discarded, and the new strands left as the coder gives them, inside the head or not.
     """
     settings, coder = settings or InterpolationSettings(), coder or EuclideanCoder()
     progress(0.0, 1.0)
     if not len(guides):
         empty = Strands(np.zeros((0, 3), np.float32), np.zeros(1, np.int64))
         return Dense(_attributed(empty, np.zeros((0, 2)), np.zeros(0), 0), {"guides": 0, "new strands": 0})
-    guides, tally = _thinned(guides, count)
+    drawn = settings.method == "texture"
+    guides, tally = _thinned(guides, 0 if drawn else count)
     rooted = head.closest_scalp(guides.roots)
     uv = np.asarray(guides.strand_attributes.get("root_uv", rooted.uv), np.float32)
     uv = np.where(np.isfinite(uv).all(axis=1, keepdims=True), uv, rooted.uv)
     tally["guides with their root off the scalp"] = int(np.count_nonzero(rooted.distance > ROOT_REACH))
     support = np.asarray(guides.strand_attributes.get("support", np.ones(len(guides))), np.float32)
-    wanted = count - len(guides) if count > 0 else PAPER_SAMPLES
-    places = _places(rooted.position, uv, head, wanted, count, settings, seed, tally)
+    if drawn:
+        places, more = drawn_texels(head, uv, count or PAPER_SAMPLES, settings, seed)
+        tally |= more
+    else:
+        wanted = count - len(guides) if count > 0 else PAPER_SAMPLES
+        places = _places(rooted.position, uv, head, wanted, count, settings, seed, tally)
     if not len(places.uv):
         return Dense(_attributed(guides, uv, support, len(guides)), tally | {"new strands": 0})
     progress(0.2, 1.0)
@@ -91,21 +99,28 @@ def fill_scalp(
     codes = coder.encode(shapes)
     directions, lengths = _directions(shapes), guides.lengths()
     neighbours = min(settings.neighbours, len(guides))
-    distance, near = cKDTree(uv).query(places.uv, k=neighbours)
+    texels = (uv, places.uv)
+    if drawn:
+        texels = tuple(texels_of(some, settings.texture or SIDE) for some in texels)
+    distance, near = cKDTree(texels[0]).query(texels[1], k=neighbours)
     distance, near = distance.reshape(len(places.uv), -1), near.reshape(len(places.uv), -1)
     new = np.empty((len(places.uv), SHAPE_POINTS, 3), np.float32)
     alone = 0
     for start in range(0, len(new), CHUNK):
         progress(0.2 + 0.4 * start / len(new), 1.0)
         rows = slice(start, start + CHUNK)
-        weights = blend_weights(distance[rows], near[rows], directions, lengths, settings.similarity)
+        if drawn:
+            weights = eq3_weights(distance[rows], near[rows], codes)
+        else:
+            weights = blend_weights(distance[rows], near[rows], directions, lengths, settings.similarity)
         alone += int(np.count_nonzero((weights > 0.0).sum(axis=1) == 1))
         made = coder.decode(blend(codes[near[rows]], weights))
         turned = np.einsum("nij,npi->npj", head.frames(places.face[rows], places.bary[rows]), made)
         new[rows] = turned + places.position[rows][:, None]
     tally |= {"new strands": len(new), "copied from one guide: its neighbours part ways": alone}
-    new, pushed = _outside(new, head, part(progress, 0.6, 0.9))
-    tally["new strands pushed out of the head"] = pushed
+    if not drawn:
+        new, pushed = _outside(new, head, part(progress, 0.6, 0.9))
+        tally["new strands pushed out of the head"] = pushed
     made = Strands.from_array(new)
     backed = support_along(made, density, hair_level)[1] if density is not None else np.zeros(len(made), np.float32)
     guides = Strands(guides.points, guides.offsets)

@@ -23,8 +23,9 @@ TOP_QUANTILE = 0.99
 CURVE_POINTS = 64
 """Points of each strand after cubic interpolation (supplement 4)."""
 BETAS = (0.9, 0.999)
-SEARCH = 3
-"""Voxels around a strand point within which its nearest target points are looked for; farther ones exert no pull."""
+SEARCH = 12
+"""Voxels around a strand point within which its nearest target points are looked for, ring by ring; the paper gives no limit,
+and a point farther than this from all hair is pulled by none."""
 
 
 def fit_to_points(
@@ -220,32 +221,38 @@ def _nearest(table, bricks, voxels, seed, codes):
         distances = np.full(count, np.inf)
         x, y, z = voxels[n, 0], voxels[n, 1], voxels[n, 2]
         cx, cy, cz = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
-        for i in range(cx - SEARCH, cx + SEARCH + 1):
-            for j in range(cy - SEARCH, cy + SEARCH + 1):
-                for k in range(cz - SEARCH, cz + SEARCH + 1):
-                    if i < 0 or j < 0 or k < 0:
-                        continue
-                    if (i >> 4) >= table.shape[0] or (j >> 4) >= table.shape[1] or (k >> 4) >= table.shape[2]:
-                        continue
-                    row = table[i >> 4, j >> 4, k >> 4]
-                    if row < 0:
-                        continue
-                    held = bricks[row, i & 15, j & 15, k & 15]
-                    for point in range(held):
-                        code = ((np.int64(row) * 4096 + (i & 15) * 256 + (j & 15) * 16 + (k & 15)) << 3) + point
-                        dx = i + _jitter(code, seed, 0) - x
-                        dy = j + _jitter(code, seed, 1) - y
-                        dz = k + _jitter(code, seed, 2) - z
-                        d = dx * dx + dy * dy + dz * dz
-                        if d >= distances[count - 1]:
+        for ring in range(SEARCH + 1):
+            # points of farther rings are farther than ring - 1: a voxel's points lie up to half a voxel from its centre
+            if ring > 1 and distances[count - 1] <= (ring - 1.0) ** 2:
+                break
+            for i in range(cx - ring, cx + ring + 1):
+                for j in range(cy - ring, cy + ring + 1):
+                    face = abs(i - cx) == ring or abs(j - cy) == ring
+                    step = 1 if face or ring == 0 else 2 * ring
+                    for k in range(cz - ring, cz + ring + 1, step):
+                        if i < 0 or j < 0 or k < 0:
                             continue
-                        slot = count - 1
-                        while slot > 0 and distances[slot - 1] > d:
-                            distances[slot] = distances[slot - 1]
-                            codes[n, slot] = codes[n, slot - 1]
-                            slot -= 1
-                        distances[slot] = d
-                        codes[n, slot] = code
+                        if (i >> 4) >= table.shape[0] or (j >> 4) >= table.shape[1] or (k >> 4) >= table.shape[2]:
+                            continue
+                        row = table[i >> 4, j >> 4, k >> 4]
+                        if row < 0:
+                            continue
+                        held = bricks[row, i & 15, j & 15, k & 15]
+                        for point in range(held):
+                            code = ((np.int64(row) * 4096 + (i & 15) * 256 + (j & 15) * 16 + (k & 15)) << 3) + point
+                            dx = i + _jitter(code, seed, 0) - x
+                            dy = j + _jitter(code, seed, 1) - y
+                            dz = k + _jitter(code, seed, 2) - z
+                            d = dx * dx + dy * dy + dz * dz
+                            if d >= distances[count - 1]:
+                                continue
+                            slot = count - 1
+                            while slot > 0 and distances[slot - 1] > d:
+                                distances[slot] = distances[slot - 1]
+                                codes[n, slot] = codes[n, slot - 1]
+                                slot -= 1
+                            distances[slot] = d
+                            codes[n, slot] = code
 
 
 @numba.njit(cache=True, parallel=True)
