@@ -1,4 +1,4 @@
-"""The command line: synthesize | reconstruct | evaluate | convert. Options of `reconstruct` are made from `settings.py`.
+"""The command line: synthesize | reconstruct | evaluate | benchmark | convert. Options of `reconstruct` are made from `settings.py`.
 
 Exit codes: 0 done, 1 refused with a clear error, 2 wrong usage, 130 cancelled.
 """
@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ct2hair", description="Hair strands from a CT scan of a wig.")
     parser.add_argument("--version", action="version", version=f"ct2hair {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (_add_synthesize, _add_reconstruct, _add_evaluate, _add_convert):
+    for add in (_add_synthesize, _add_reconstruct, _add_evaluate, _add_benchmark, _add_convert):
         add(commands)
     return parser
 
@@ -245,6 +245,36 @@ def _evaluate(chosen: argparse.Namespace) -> int:
     if chosen.json:
         chosen.json.write_text(json.dumps(scores, indent=2))
     print(format_scores(scores))
+    return DONE
+
+
+def _add_benchmark(commands) -> None:
+    parser = _add_command(
+        commands, "benchmark", _benchmark, "measure the method and the paper's side by side on scans made here"
+    )
+    parser.add_argument("name", metavar="NAME", help="quick (minutes), table1, ablation, scale or peers")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="folder for scans and results")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[101], metavar="N", help="seeds of hair and noise")
+    parser.add_argument("--strands", type=int, default=0, metavar="N", help="strands of each scan; 0 takes the set's")
+    parser.add_argument("--spacing", type=float, default=0.0, metavar="MM", help="voxel size; 0 takes the set's [mm]")
+    parser.add_argument("--snr", type=float, default=4.0, metavar="S", help="a lone strand's peak over the noise")
+    parser.add_argument("--styles", nargs="+", default=[], metavar="STYLE", help="hairstyles instead of the set's")
+    parser.add_argument("--largest", type=float, default=3e6, metavar="VOXELS", help="scale: active voxels at most")
+    parser.add_argument("--threads", type=int, default=0, metavar="N", help="processor threads; 0 takes all")
+    parser.add_argument("--keep", action="store_true", help="keep the folders of the reconstructions")
+    parser.add_argument("--fresh", action="store_true", help="forget results of earlier calls")
+
+
+def _benchmark(chosen: argparse.Namespace) -> int:
+    from dataclasses import fields
+
+    from .benchmark import Options, run_benchmark
+
+    options = Options(**{known.name: getattr(chosen, known.name) for known in fields(Options)})
+    page = run_benchmark(
+        chosen.name, chosen.out, options, say=lambda text: print(f"ct2hair: {text}", file=sys.stderr, flush=True)
+    )
+    print(page.read_text(encoding="utf-8"))
     return DONE
 
 

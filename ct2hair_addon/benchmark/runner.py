@@ -1,0 +1,238 @@
+"""One scan, one method: made, reconstructed, scored stage by stage, and kept, so that a run that was cut off goes on.
+
+A result is kept under a key of the scan, the settings and the engine's own sources: where any of them changes, it is made anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+
+from ..evaluation import (
+    centre_line_error,
+    coverage,
+    direction_share,
+    evaluate,
+    hairstyle,
+    orientation_error,
+    registration_error,
+    rooted_length,
+    synthesize,
+)
+from ..head import Head, HeadMesh, load_obj, remove_hairnet, template_head
+from ..measure import Meter, machine_memory
+from ..orientation import OrientationField, orientation_field
+from ..pipeline import Silent, reconstruct
+from ..settings import Settings
+from ..strands import Strands
+from ..volume import BRICK, BrickVolume, load_vdb
+
+VOXELS = (1.25, 2.5)
+"""Voxels of the voxel scores in units of the scan's (EVALUATION.md)."""
+COVERED = 2.5
+"""A hair voxel is covered by a guide within this many voxels of the scan: 1 mm at 0.4 mm."""
+ORIENTED = 200_000
+"""Hair voxels at most that the orientation error is taken at."""
+QUERIES = 300_000
+"""Millimetres of strand asked at most in each direction: a score's standard error stays under 0.2 %."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan to be made: hairstyle, strands, voxel size (mm), signal-to-noise ratio, seed of hair and noise."""
+
+    style: str
+    strands: int
+    spacing: float
+    snr: float = 4.0
+    seed: int = 101
+
+    @property
+    def name(self) -> str:
+        return f"{self.style}-{self.strands}-{self.spacing:g}mm-snr{self.snr:g}-seed{self.seed}"
+
+    @property
+    def fill(self) -> float:
+        """Strands times a voxel's face, mm^2: how hard the scan is (EVALUATION.md)."""
+        return self.strands * self.spacing**2
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A scan on disk with what is true in it, all in its frame."""
+
+    path: Path
+    truth: Strands
+    head: HeadMesh
+
+
+class Bench:
+    """A folder of scans, runs and results. say: told, line by line, what is being done."""
+
+    def __init__(self, folder: Path, say: Say = lambda text: None, keep: bool = False) -> None:
+        self.folder, self.say, self._keep = Path(folder), say, keep
+        self.load = _load()
+
+    def scan(self, case: Case) -> Scan:
+        """The case's scan, made where it isn't there yet."""
+        path = self.folder / "scans" / f"{case.name}.vdb"
+        done = path.with_suffix(".json")
+        if not done.is_file() or json.loads(done.read_text()).get("sources") != sources():
+            self.say(f"{case.name}: making the scan")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            head = template_head()
+            meter = Meter()
+            strands = hairstyle(case.style, head, case.strands, case.seed)
+            made = synthesize(strands, head, path, case.spacing, snr=case.snr, seed=case.seed)
+            cost = {"seconds": meter.seconds, "peak_memory": meter.peak_memory}
+            _write_json(done, made.description | {"sources": sources(), "cost": cost})
+        beside = path.with_suffix("")
+        truth = Strands.load(beside.with_name(f"{beside.name}.strands.npz"))
+        return Scan(path, truth, load_obj(beside.with_name(f"{beside.name}.head.obj"), align=False))
+
+    def run(self, case: Case, label: str, settings: Settings) -> dict[str, Any]:
+        """Everything measured of one method on one scan, as plain values: see `_measured`."""
+        return self.kept(
+            f"{case.name}.{label}", {"settings": settings.to_dict()}, lambda: self._measured(case, label, settings)
+        )
+
+    def kept(self, name: str, depends: dict[str, Any], work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """A result from its file, or by `work`; `depends` and the engine's sources are its key."""
+        key = _digest({"name": name, "threads": numba.get_num_threads(), "sources": sources(), **depends})
+        path = self.folder / "results" / f"{name}.{key[:12]}.json"
+        if path.is_file():
+            self.say(f"{name}: known")
+            return json.loads(path.read_text())
+        result = work()
+        _write_json(path, result)
+        return json.loads(path.read_text())
+
+    def density(self, folder: Path, head: HeadMesh, settings: Settings) -> BrickVolume:
+        """The wig's density of a run, the net taken out as in the run itself."""
+        return remove_hairnet(load_vdb(folder / "volume.vdb"), Head(head), settings.head)[0]
+
+    def _measured(self, case: Case, label: str, settings: Settings) -> dict[str, Any]:
+        scan = self.scan(case)
+        # stages that two methods share are done once: the folder is that of what comes before the guides' scores
+        upstream = {stage: settings.to_dict()[stage] for stage in ("scan", "head", "orientation", "guides", "run")}
+        folder = self.folder / "runs" / f"{case.name}.{_digest({'sources': sources(), **upstream})[:12]}"
+        self.say(f"{case.name}: reconstructing, {label}")
+        made = reconstruct(scan.path, folder, settings, observer=_Told(self.say, f"{case.name}, {label}"))
+        self.say(f"{case.name}: scoring, {label}")
+        scan_report = made.report["scan"]
+        voxels = tuple(scale * case.spacing for scale in VOXELS)
+        scores = {
+            stage: evaluate(scan.truth, strands, made.head, voxels, QUERIES)
+            for stage, strands in (("guides", made.guides), ("dense", made.dense), ("refined", made.hair))
+        }
+        for table in scores.values():  # whatever the voxel, the first is the finer one
+            table["voxel"] = dict(zip(("fine", "coarse"), table["voxel"].values(), strict=True))
+        density = self.density(folder, made.head, settings)
+        level = scan_report["hair_level"]
+        own = scores["guides"]
+        own["centre_line_mm"] = centre_line_error(made.guides, scan.truth)
+        own["coverage"] = coverage(made.guides, density, level, COVERED * case.spacing)
+        for stage, strands in (("guides", made.guides), ("refined", made.hair)):
+            scores[stage]["direction"] = direction_share(strands, scan.truth, QUERIES)
+            scores[stage]["rooted_length"] = rooted_length(strands, made.head)
+        stages = [{name: value for name, value in stage.items() if name != "tally"} for stage in made.report["stages"]]
+        return {
+            "case": asdict(case) | {"fill": case.fill},
+            "label": label,
+            "settings": settings.to_dict(),
+            "hair_voxels": scan_report["hair_voxels"],
+            "scores": scores,
+            "registration_mm": registration_error(made.head, scan.head),
+            "axes": [made.report["head"]["face_axis"], made.report["head"]["up_axis"]],
+            "orientation": orientation_scores(density, level, settings, scan.truth),
+            "stages": stages,
+            "tallies": {stage["name"]: stage["tally"] for stage in made.report["stages"]},
+            "load": self.load,
+        }
+
+    def clear_runs(self) -> None:
+        """Delete the runs' folders, gigabytes of checkpoints, unless they are to be kept."""
+        if not self._keep:
+            shutil.rmtree(self.folder / "runs", ignore_errors=True)
+
+
+def orientation_scores(density: BrickVolume, level: float, settings: Settings, truth: Strands) -> dict[str, float]:
+    """Error of the orientation field at hair voxels (degrees), seconds, and hair voxels a second."""
+    meter = Meter()
+    field = orientation_field(density, level, settings.orientation)
+    seconds = meter.seconds
+    points, directions = oriented_voxels(field)
+    return {
+        **orientation_error(points, directions, truth),
+        "seconds": seconds,
+        "hair_voxels": field.tally["hair voxels"],
+        "peak_memory": meter.peak_memory,
+    }
+
+
+def oriented_voxels(field: OrientationField, most: int = ORIENTED) -> tuple[np.ndarray, np.ndarray]:
+    """((M, 3) mm, (M, 3) int8) places and directions of at most `most` voxels of the field, drawn with a fixed seed."""
+    rows, i, j, k = np.nonzero(field.confidence.bricks)
+    if len(rows) > most:
+        drawn = np.sort(np.random.default_rng(0).permutation(len(rows))[:most])
+        rows, i, j, k = rows[drawn], i[drawn], j[drawn], k[drawn]
+    voxels = BRICK * field.direction.brick_index[rows].astype(np.int64) + np.stack([i, j, k], axis=1)
+    return field.direction.to_scan(voxels), field.direction.bricks[rows, i, j, k]
+
+
+def machine() -> dict[str, Any]:
+    """The machine that it runs on: cores, threads in use, memory."""
+    return {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "memory_gb": round(machine_memory(), 1)}
+
+
+@functools.cache
+def sources() -> str:
+    """A digest of the engine's sources, the benchmark's own left out: other code may give other results."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        place = path.relative_to(root)
+        if place.parts[0] not in ("benchmark", "scene", "jobs", "cli.py", "batch.py", "__main__.py"):
+            digest.update(place.as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+class _Told(Silent):
+    """Tells which stage a reconstruction is in."""
+
+    def __init__(self, say: Say, name: str) -> None:
+        self._say, self._name = say, name
+
+    def started(self, stage: str, text: str) -> None:
+        self._say(f"{self._name}: {text}")
+
+
+def _load() -> float | None:
+    """Processes that ran or waited for a core in the last minute: above the cores, times are longer than they need be."""
+    try:
+        return round(os.getloadavg()[0], 1)
+    except (AttributeError, OSError):  # Windows
+        return None
+
+
+def _digest(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _write_json(path: Path, values: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.part")
+    beside.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    beside.replace(path)
