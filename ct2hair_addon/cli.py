@@ -1,4 +1,6 @@
-"""The command line: synthesize | reconstruct | evaluate | benchmark | convert. Options of `reconstruct` are made from `settings.py`.
+"""The command line: synthesize | reconstruct | evaluate | benchmark | convert.
+
+The options of `reconstruct` are made from `settings.py`.
 
 Exit codes: 0 done, 1 refused with a clear error, 2 wrong usage, 130 cancelled.
 """
@@ -249,9 +251,7 @@ def _evaluate(chosen: argparse.Namespace) -> int:
 
 
 def _add_benchmark(commands) -> None:
-    parser = _add_command(
-        commands, "benchmark", _benchmark, "measure the method and the paper's side by side on scans made here"
-    )
+    parser = _add_command(commands, "benchmark", _benchmark, "measure our method and the paper's side by side on made scans")
     parser.add_argument("name", metavar="NAME", help="quick (minutes), table1, ablation, scale or peers")
     parser.add_argument("--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="folder for scans and results")
     parser.add_argument("--seeds", type=int, nargs="+", default=[101], metavar="N", help="seeds of hair and noise")

@@ -43,8 +43,11 @@ PAPER_STRANDS = 100_000
 
 @dataclass(frozen=True)
 class Options:
-    """What of a set can be changed. strands, spacing: of each scan (0: the set's own). styles: of table1 and ablation (empty:
-    the set's own). largest: active voxels of the largest scan of `scale`. keep: keep the runs' folders. fresh: forget results."""
+    """What of a set can be changed.
+
+    strands, spacing (mm): of each scan; 0 takes the set's own, as no styles do. largest: active voxels of the largest scan of
+    `scale`. keep: keep the runs' folders. fresh: forget results of earlier calls.
+    """
 
     seeds: Sequence[int] = (101,)
     strands: int = 0
@@ -270,9 +273,8 @@ def scale(bench: Bench, options: Options) -> Page:
     }
     notes = _notes(options, results.values())
     if left_out:
-        notes.append(
-            f"Left out, larger than --largest {options.largest:g} active voxels: scans of {', '.join(map(str, left_out))} strands."
-        )
+        counts = ", ".join(map(str, left_out))
+        notes.append(f"Left out, larger than --largest {options.largest:g} active voxels: scans of {counts} strands.")
     return Page([cost_table(results), stage_table(results)], pictures, notes, list(results.values()))
 
 
@@ -287,9 +289,7 @@ def peers(bench: Bench, options: Options) -> Page:
     )  # fmt: skip
     notes = []
     if peers_.installed() is None:
-        notes.append(
-            "structure-tensor is not installed here, so ours stands alone: pip install structure-tensor and run again."
-        )
+        notes.append("structure-tensor isn't installed here, so ours stands alone: pip install structure-tensor and run again.")
     numbers = []
     for case in _cases(options, options.styles or ("wavy", "curly"), FULL):
 

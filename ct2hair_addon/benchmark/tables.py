@@ -58,8 +58,8 @@ def table1(results: dict[tuple[str, str], dict[str, Any]], names: dict[str, str]
     table = Table(
         "Table 1: voxels of 1.25 times the scan's",
         ("style", "strands", "IoU", "precision", "recall", "MSE (10^-2)", "IoU, 2.5 voxels"),
-        note="Printed: the paper's own table, on its own hair and its own voxel size, which it does not state; read the rows of "
-        "one hairstyle against each other.",
+        note="Printed: the paper's own table, on its own hair and its own voxel size, which it does not state; read the rows "
+        "of one hairstyle against each other.",
     )
     for row, style in names.items():
         title = f"{row} ({style})"
