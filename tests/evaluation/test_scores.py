@@ -8,10 +8,13 @@ from scipy.spatial import cKDTree
 from ct2hair_addon.evaluation import (
     centre_line_error,
     coverage,
+    direction_share,
     evaluate,
     format_scores,
     orientation_error,
+    registration_error,
     render_density,
+    rooted_length,
     scan_scores,
     strand_peak,
 )
@@ -80,6 +83,20 @@ def test_voxel_scores_equal_dense_arrays():
     assert scores["precision"] == pytest.approx((true & found).sum() / found.sum(), rel=2e-3)
     assert scores["recall"] == pytest.approx((true & found).sum() / true.sum(), rel=2e-3)
     assert scores["mse"] == pytest.approx(squared[true | found].mean(), rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("voxel", "count", "page"), [(0.5, 240, (0.85, 0.71, 0.54, 0.33)), (1.0, 150, (0.95, 0.89, 0.82, 0.70))]
+)
+def test_a_known_position_error_costs_the_pages_iou(voxel, count, page):
+    # EVALUATION.md's figures; they hold for one density of hair, here 0.27 and 0.17 strands a square millimetre
+    truth = waves(count)
+    generator = np.random.default_rng(0)
+    for error, expected in zip((0.1, 0.25, 0.5, 1.0), page, strict=True):
+        direction = generator.normal(size=(count, 3))
+        direction *= error / np.linalg.norm(direction, axis=1, keepdims=True)
+        shifted = truth.with_points(truth.points + direction[truth.strand_index].astype(np.float32))
+        assert voxel_scores(truth, shifted, voxel)["iou"] == pytest.approx(expected, abs=0.02)
 
 
 def test_half_a_result_has_full_precision_and_half_the_recall():
@@ -154,6 +171,38 @@ def test_orientation_and_centre_line_errors():
     assert error["median"] == pytest.approx(12.0, abs=1e-3) and error["compared"] == 0.75
     shifted = lines(([0.3, 0.4, 0.13], [0.3, 0.4, 39]))
     assert centre_line_error(shifted, truth)["median"] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_direction_is_the_share_of_length_that_runs_as_the_truth_does():
+    truth = lines(([0, 0, 0], [0, 0, 40]), ([20, 0, 0], [20, 0, 40]))
+    # 30 mm the right way, 10 mm the wrong one, 40 mm with nothing near, 40 mm across the truth
+    result = lines(
+        ([0.5, 0, 5], [0.5, 0, 35]),
+        ([20, 0.5, 30], [20, 0.5, 20]),
+        ([50, 0, 0], [50, 0, 40]),
+        ([-20, 0, 20], [19, 0, 20]),
+    )
+    share = direction_share(result, truth)
+    assert share["right"] == pytest.approx(0.75, abs=0.03)
+    assert share["compared"] == pytest.approx(40 / 119, abs=0.02)
+    assert direction_share(truth, truth) == {"right": 1.0, "compared": 1.0}
+    assert direction_share(truth.reversed(), truth)["right"] == 0.0
+
+
+def test_rooted_length_weighs_strands_by_length(ball):
+    # 60 mm from the scalp, 30 mm that starts 2 mm over it
+    strands = lines(([0, 0, 40], [0, 0, 100]), ([0, 42, 0.5], [0, 72, 0.5]))
+    assert rooted_length(strands, ball) == pytest.approx(60 / 90, abs=1e-3)
+    assert rooted_length(strands.select(np.zeros(0, np.int64)), ball) == 0.0
+
+
+def test_registration_error_is_the_scalps_distance(ball):
+    assert registration_error(ball, ball)["median"] < 1e-3
+    # a scalp grown by a twentieth lies 2 mm out everywhere
+    larger = ball.transformed(np.diag([1.05, 1.05, 1.05, 1.0]))
+    error = registration_error(larger, ball)
+    assert error["median"] == pytest.approx(2.0, abs=0.05) and error["p90"] == pytest.approx(2.0, abs=0.05)
+    assert error["beyond"] == pytest.approx(2.0, abs=0.05)
 
 
 def test_coverage_is_the_share_of_hair_with_a_strand_near():
