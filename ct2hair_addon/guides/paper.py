@@ -32,12 +32,14 @@ AT_REST = 0.02
 """voxel; a shorter shift is the last."""
 MOST_SHIFT = 2.0
 """voxel; how far a point may come from its voxel in all: farther it is another strand's."""
-CAPTURE = 1.0
+CAPTURE = 1.5
 """voxel; filtered points this close to an Euler step's end draw it onto themselves."""
-CAPTURE_WIDTH = 0.5
+CAPTURE_WIDTH = 0.75
 """voxel; width of the Gaussian of that."""
-TAKEN = 1.25
+TAKEN = 1.5
 """voxel; points this close to a segment, and within `guides.max_turn` of its direction, belong to it and to no other."""
+SHORTEST = 6
+"""Points of a segment at least, as in tracing: fewer are noise, however long a voxel is."""
 MOST_STEPS = 4000
 STALE = 3
 """Steps without a point that is new to the segment after which it ends: it runs in a circle."""
@@ -167,7 +169,7 @@ def euler_segments(
     table, heads, following = _cells(points.places, np.array(shape, np.int64))
     order = _seed_order(points.confidence, seed)
     owner = np.full(len(points), -1, np.int32)
-    shortest = max(round(settings.min_length / (settings.step * spacing)), 2)
+    shortest = max(round(settings.min_length / (settings.step * spacing)), SHORTEST)
     turn = np.cos(np.radians(settings.max_turn))
     room = min(PATH_ROOM, 4 * len(points) + 2 * MOST_STEPS + 2)
     paths, ends = np.empty((room, 3), np.float32), np.empty((room // 2, 2), np.int64)
