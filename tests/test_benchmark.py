@@ -9,7 +9,7 @@ import pytest
 from ct2hair_addon import cli
 from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, runner
 from ct2hair_addon.benchmark.peers import fullest_cube
-from ct2hair_addon.benchmark.sets import methods
+from ct2hair_addon.benchmark.sets import _flags, methods
 from ct2hair_addon.benchmark.tables import PRINTED, Table, shown
 from ct2hair_addon.errors import SettingsError
 from ct2hair_addon.orientation import OrientationField
@@ -91,6 +91,13 @@ def test_the_fullest_cube_holds_the_most_hair():
     assert fullest_cube(BrickVolume.from_dense(volume, 1.0), 1.0, edge=2).tolist() == [2, 1, 0]
 
 
+def test_the_page_says_how_to_get_it_again():
+    assert _flags(Options(seeds=[101], styles=[])) == ""
+    assert _flags(Options(seeds=[3, 4], styles=["bob"], snr=2.0, keep=True, fresh=True)) == (
+        " --seeds 3 4 --snr 2.0 --styles bob --keep"
+    )
+
+
 def test_unknown_sets_and_styles_are_refused(tmp_path, capsys):
     with pytest.raises(SettingsError, match="unknown benchmark 'huge'"):
         run_benchmark("huge", tmp_path)
@@ -103,7 +110,7 @@ def test_unknown_sets_and_styles_are_refused(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_tiny_set_ends_with_its_tables_and_goes_on_from_what_it_has(tmp_path, capsys):
-    command = ["benchmark", "quick", "--styles", "pixie", "--strands", "250", "--spacing", "2", "--out", str(tmp_path)]
+    command = ["benchmark", "quick", "--styles", "bob", "--strands", "500", "--spacing", "1.6", "--out", str(tmp_path)]
     assert cli.main(command) == cli.DONE
     first = capsys.readouterr()
     assert "paper: refined" in first.out and "ours: guides" in first.out

@@ -190,7 +190,7 @@ def ablation(bench: Bench, options: Options) -> Page:
         known = methods(case)
         paper, ours = (_threaded(known[name], options) for name in ("paper", "ours"))
         # no refinement is wanted where only what comes before it is looked at
-        bare = {"refinement.iterations": 0}
+        bare = {"refinement.iterations": 0, "refinement.prune": False}
         variants = {
             "raw gradients (paper)": paper.changed(bare),
             "Gabor filters": paper.changed({**bare, "orientation.method": "gabor"}),
@@ -367,9 +367,9 @@ def _write(name: str, out: Path, options: Options, page: Page, seconds: float, b
         f"This call took {seconds / 60:.1f} minutes.",
         "",
         *(f"- {note}" for note in page.notes),
-        "",
+        *([""] if page.notes else []),
     ]
-    text = "\n".join(lines) + "\n".join(table.markdown() for table in page.tables)
+    text = "\n".join(lines) + "\n" + "\n".join(table.markdown() for table in page.tables)
     for picture, svg in page.pictures.items():
         path = out / f"{name}-{picture}.svg"
         path.write_text(svg, encoding="utf-8")
@@ -389,8 +389,8 @@ def _flags(options: Options) -> str:
     usual, flags = Options(), ""
     for known in dataclasses.fields(Options):
         value = getattr(options, known.name)
-        if known.name == "fresh" or value == getattr(usual, known.name):
+        values = list(value) if isinstance(value, (list, tuple)) else [] if value is True else [value]
+        if known.name == "fresh" or value == getattr(usual, known.name) or tuple(values) == getattr(usual, known.name):
             continue
-        values = value if isinstance(value, (list, tuple)) else [] if value is True else [value]
         flags += f" --{known.name} {' '.join(map(str, values))}".rstrip()
     return flags
