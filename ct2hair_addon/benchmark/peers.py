@@ -5,19 +5,23 @@ It works on dense arrays, so both get the fullest cube of the scan. Where the pa
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
 from ..evaluation import orientation_error
+from ..head import Head, HeadMesh, remove_hairnet
 from ..orientation import orientation_field
-from ..settings import OrientationSettings
+from ..settings import OrientationSettings, Settings
 from ..strands import Strands
-from ..volume import BRICK, BrickVolume
+from ..volume import BRICK, BrickVolume, find_thresholds, import_scan, open_scan
 
 EDGE = 12
 """Bricks along an edge of the cube: 7 million voxels."""
@@ -49,6 +53,13 @@ def fullest_cube(density: BrickVolume, level: float, edge: int = EDGE) -> np.nda
             sums, np.arange(sums.shape[axis] - width), axis=axis
         )
     return np.array(np.unravel_index(int(np.argmax(sums)), sums.shape))
+
+
+def hair_of(scan: Path, head: HeadMesh, settings: Settings) -> tuple[BrickVolume, float]:
+    """(density, hair level) of a scan; the net, which has directions of its own, is taken out around the true head."""
+    reader = open_scan(scan, settings.scan)
+    wig = import_scan(reader, find_thresholds(reader, settings.scan), settings.scan)
+    return remove_hairnet(wig.density, Head(head), settings.head)[0], wig.hair_level
 
 
 def compare(density: BrickVolume, level: float, truth: Strands) -> list[dict[str, Any]]:
@@ -108,6 +119,17 @@ def _structure_tensor(dense: np.ndarray, sigma: float, rho: float) -> np.ndarray
     from structure_tensor.multiprocessing import parallel_structure_tensor_analysis
 
     devices = ["cpu"] * numba.get_num_threads()
-    _, _, vectors = parallel_structure_tensor_analysis(dense, sigma, rho, devices=devices, block_size=BLOCK)
+    with _plain_termination():
+        _, _, vectors = parallel_structure_tensor_analysis(dense, sigma, rho, devices=devices, block_size=BLOCK)
     # its first component runs along the array's last axis
     return vectors[::-1]
+
+
+@contextlib.contextmanager
+def _plain_termination() -> Iterator[None]:
+    """SIGTERM as the system has it: processes forked meanwhile end by it without a word."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

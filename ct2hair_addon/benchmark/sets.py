@@ -16,7 +16,6 @@ from .. import __version__
 from ..errors import SettingsError
 from ..evaluation import STYLES
 from ..settings import Settings, parameters
-from ..volume import find_thresholds, import_scan, open_scan
 from . import peers as peers_
 from . import plots
 from .runner import Bench, Case, Say, machine, sources
@@ -303,12 +302,8 @@ def peers(bench: Bench, options: Options) -> Page:
 
         def work(case: Case = case) -> dict[str, Any]:
             scan = bench.scan(case)
-            settings = _threaded(Settings(), options)
-            reader = open_scan(scan.path, settings.scan)
-            bench.say(f"{case.name}: importing")
-            wig = import_scan(reader, find_thresholds(reader, settings.scan), settings.scan)
             bench.say(f"{case.name}: comparing")
-            rows = peers_.compare(wig.density, wig.hair_level, scan.truth)
+            rows = peers_.compare(*peers_.hair_of(scan.path, scan.head, _threaded(Settings(), options)), scan.truth)
             return {"case": dataclasses.asdict(case), "rows": rows, "load": bench.load}
 
         result = bench.kept(f"{case.name}.peers", {"structure-tensor": peers_.installed()}, work)
