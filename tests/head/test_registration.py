@@ -27,7 +27,7 @@ def placed(face: str, up: str, scale: float, lean: float) -> np.ndarray:
     return matrix
 
 
-def scanned(head: Head, matrix, count=2500, noise=0.4, junk=0.3, seed=0):
+def scanned(head: Head, matrix, count=1800, noise=0.4, junk=0.3, seed=0):
     """(knots, mannequin points) of a template placed in the scan: noise on the knots, and a share of junk in the hair."""
     generator = np.random.default_rng(seed)
     sample = head.sample_scalp(count, seed)
@@ -117,4 +117,3 @@ def test_a_head_is_bent_onto_anothers_roots(template, template_queries):
     fitted = Head(found.head)
     assert np.quantile(fitted.closest_scalp(roots).distance, 0.95) < 1.0
     assert found.face_axis == "-y" and found.up_axis == "+z"
-    np.testing.assert_array_equal(found.head.vertices, fit_to_roots(template, roots).head.vertices)
