@@ -96,11 +96,11 @@ def test_displaced_strands_find_back_to_the_volume(kind, fitted):
     assert np.median(apart) < 0.25 and apart.max() < 2.0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_lengths_are_kept_and_roots_held(kind, fitted):
+@pytest.mark.parametrize(("kind", "stretch"), [("straight", 5e-4), ("curly", 0.02)])
+def test_lengths_are_kept_and_roots_held(kind, stretch, fitted):
     _, given, result, _ = fitted[kind]
     np.testing.assert_array_equal(result.strands.roots, given.roots)
-    assert np.abs(result.strands.lengths() / given.lengths() - 1.0).max() < 0.03
+    assert np.abs(result.strands.lengths() / given.lengths() - 1.0).max() < stretch
     np.testing.assert_array_equal(result.strands.strand_attributes["root_uv"], given.strand_attributes["root_uv"])
 
 
