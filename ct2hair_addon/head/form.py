@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse import coo_matrix, diags
+from scipy.sparse.csgraph import connected_components
 
 from .flatten import unwrap
 from .mesh import HeadMesh
@@ -248,7 +249,17 @@ def _surface_nets(field, form):
                 corners.append(index[tuple(at.T)])
             quad = np.stack(corners, axis=1)
             quads.append(quad if sign > 0 else quad[:, ::-1])
-    return vertices, np.concatenate(quads), mirror
+    return _outer_surface(vertices, np.concatenate(quads), mirror)
+
+
+def _outer_surface(vertices, quads, mirror):
+    """The largest piece of the surface alone: cuts and blends leave bubbles of a cell inside the solid."""
+    sides = np.stack([quads.ravel(), np.roll(quads, -1, axis=1).ravel()])
+    graph = coo_matrix((np.ones(sides.shape[1]), sides), (len(vertices),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    kept = label == np.bincount(label).argmax()
+    number = np.cumsum(kept) - 1
+    return vertices[kept], number[quads[kept[quads[:, 0]]]], number[mirror[kept]]
 
 
 def _half_grid(field, x, y, z):

@@ -13,7 +13,7 @@ import numpy as np
 LEAF = 4
 """Triangles in a leaf: the least time a query on meshes of 10,000 to 50,000 triangles."""
 FAR_FIELD = 2.0
-"""A node farther from the point than this many of its radii counts as one dipole: error of the winding number < 0.02."""
+"""A node farther from the point than this many of its radii counts as one dipole: error of the winding number < 0.05."""
 STACK = 64
 """Depth of the traversal stack: a balanced tree over 2^32 triangles needs 33."""
 CHUNK = 200_000

@@ -52,7 +52,9 @@ def shown_lengths(strands: Strands, head, floor: float) -> np.ndarray:
     lengths = strands.lengths().astype(np.float64)
     if floor <= 0.0:
         return lengths
-    steps = strands.resampled_by_step(max(floor, 0.5))
-    outside = np.asarray(head.signed_distance(steps.points)) >= floor
-    share = np.bincount(steps.strand_index, outside, len(steps)) / np.maximum(steps.counts, 1)
+    steps = strands.resampled_by_step(max(0.25 * floor, 0.5))
+    outside = (np.asarray(head.signed_distance(steps.points)) >= floor).astype(np.float64)
+    # a step counts by its two ends: without that, the root alone would take half a step from every strand
+    ends = 0.5 * (outside[steps.offsets[:-1]] + outside[steps.offsets[1:] - 1])
+    share = (np.bincount(steps.strand_index, outside, len(steps)) - ends) / np.maximum(steps.counts - 1, 1)
     return lengths * share

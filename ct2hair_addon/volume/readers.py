@@ -144,7 +144,8 @@ class ScanReader:
         """
         values = self._raw(low, high)
         if self.dtype.kind == "f":
-            total = float(values.sum(dtype=np.float64))
+            with np.errstate(invalid="ignore"):  # infinities of both signs
+                total = float(values.sum(dtype=np.float64))
             if not np.isfinite(total):
                 bad = ~np.isfinite(values)
                 found = int(np.count_nonzero(bad))
@@ -433,6 +434,10 @@ def _open_nrrd(path: Path) -> _Layout:
             if not text.startswith("#") and colon and not value.startswith("="):
                 fields[key.strip().lower()] = value.strip()
         offset = file.tell()
+    data = fields.get("data file", fields.get("datafile"))
+    listed = data is not None and (data.upper().startswith("LIST") or "%" in data)
+    if data is not None and not listed and not (path.parent / data).is_file():
+        raise ScanError(f"{path}: its data file {data} is missing; put it beside the header")
     header = _sitk_header(path)
     names = [n for n in (fields.get("space units", "") + " " + fields.get("units", "")).replace('"', " ").split() if n]
     units = {_MM[name.lower().rstrip("s")] for name in names if name.lower().rstrip("s") in _MM} | set()
@@ -440,14 +445,10 @@ def _open_nrrd(path: Path) -> _Layout:
     spaced = "space directions" in fields or "spacings" in fields
     kind = next((code for code, words in _NRRD_TYPES.items() if fields.get("type", "").lower() in words), None)
     encoding = fields.get("encoding", "raw").lower()
-    data = fields.get("data file", fields.get("datafile"))
-    listed = data is not None and (data.upper().startswith("LIST") or "%" in data)
     skips = int(fields.get("line skip", fields.get("lineskip", 0))) or int(fields.get("byte skip", fields.get("byteskip", 0)))
     if fields.get("dimension") != "3" or kind is None or encoding not in ("raw", "gzip", "gz") or listed or skips:
         return _medical(path, None, header, unit, has_spacing=spaced)
     where, offset = (path, offset) if data is None else (path.parent / data, 0)
-    if not where.is_file():
-        raise ScanError(f"{path}: its data file {where.name} is missing; put it beside the header")
     end = ">" if fields.get("endian", "little").lower() == "big" else "<"
     shape = tuple(int(n) for n in fields.get("sizes", "").split())[::-1]
     if encoding == "raw":

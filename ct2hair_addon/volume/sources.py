@@ -210,7 +210,9 @@ class DicomSlices(Source):
         values = np.empty((high - low, *self.shape[1:]), np.float32)
         for n, file in enumerate(self._files[low:high]):
             try:
-                values[n] = sitk.GetArrayViewFromImage(sitk.ReadImage(str(file)))[..., :, :].reshape(self.shape[1:])
+                # the image must outlive the view of its memory
+                image = sitk.ReadImage(str(file))
+                values[n] = sitk.GetArrayViewFromImage(image).reshape(self.shape[1:])
             except (RuntimeError, ValueError) as error:
                 reason = str(error).strip().splitlines()[-1]
                 raise ScanError(f"{file}: this slice can't be read, it may be cut short ({reason}); copy it again") from None

@@ -566,8 +566,9 @@ def _border(table, rows, where, size, every):
 
 def _kept(table: np.ndarray, bricks: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The table and bricks of those to be kept; rows move down in place, since a second copy may not fit."""
-    number = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
-    table = np.where(table >= 0, number[table], -1).astype(np.int32)
+    # the row past the last is what -1, a brick that is not stored, points to
+    number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1).astype(np.int32)
+    table = number[table]
     chunk, at = 1024, 0
     for start in range(0, len(bricks), chunk):
         part = bricks[start : start + chunk][keep[start : start + chunk]]

@@ -1,0 +1,163 @@
+"""How strands give way: the band solver, stiff steps, kept lengths, planes of the head; curves to control points and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ct2hair_addon.refinement.boundary import MARGIN, Boundary
+from ct2hair_addon.refinement.curves import control_points, polylines
+from ct2hair_addon.refinement.fit import pyramid, segment_lengths, shares
+from ct2hair_addon.refinement.motion import _solve_band, keep_lengths, stiff_step
+from ct2hair_addon.refinement.splat import render
+from ct2hair_addon.strands import Strands
+from ct2hair_addon.volume import BrickVolume
+
+
+def test_the_band_solver_is_numpys():
+    generator = np.random.default_rng(0)
+    for size in (1, 2, 3, 9):
+        one, two = generator.normal(size=size), generator.normal(size=size)
+        diagonal, right = 6.0 + generator.uniform(size=size), generator.normal(size=(size, 3))
+        matrix = np.diag(diagonal)
+        for i in range(size):
+            for reach, values in ((1, one), (2, two)):
+                if i + reach < size:
+                    matrix[i, i + reach] = matrix[i + reach, i] = values[i]
+        expected = np.linalg.solve(matrix, right)
+        found = right.copy()
+        _solve_band(diagonal.copy(), one.copy(), two.copy(), found)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def line(size=20, step=2.0):
+    points = np.zeros((size, 3))
+    points[:, 2] = step * np.arange(size)
+    return points, np.array([0, size])
+
+
+def stepped(forces, weights=None, stiffness=3.0, limit=100.0, points=None, friction=0.0):
+    rest, offsets = line()
+    points = rest.copy() if points is None else points
+    velocity = np.zeros_like(points)
+    weights = np.ones(len(points)) if weights is None else weights
+    stiff_step(points, rest, offsets, forces, weights, stiffness, 1.0, friction, limit, velocity)
+    return points, rest
+
+
+def test_without_a_force_nothing_moves_and_a_bend_from_rest_relaxes():
+    points, rest = stepped(np.zeros((20, 3)))
+    np.testing.assert_array_equal(points, rest)
+    bent = rest.copy()
+    bent[10, 0] = 1.0
+    relaxed, _ = stepped(np.zeros((20, 3)), points=bent.copy())
+    assert 0 < relaxed[10, 0] < 0.6
+
+
+def test_a_common_force_moves_all_but_the_root_and_a_single_one_is_spread():
+    force = np.zeros((20, 3))
+    force[:, 0] = 1.0
+    points, _ = stepped(force, stiffness=1.0)
+    assert not points[0].any()
+    np.testing.assert_allclose(points[8:, 0], 1.0, atol=0.1)
+    force[:] = 0.0
+    force[10, 0] = 1.0
+    loose, _ = stepped(force, stiffness=0.5)
+    stiff, _ = stepped(force, stiffness=8.0)
+    assert loose[10, 0] > 0.9 and abs(loose[13, 0]) < 0.01
+    assert stiff[10, 0] < 0.3 and stiff[13, 0] > 0.5 * stiff[10, 0]
+
+
+def test_points_without_weight_follow_their_neighbours_and_no_step_is_longer_than_the_limit():
+    force = np.zeros((20, 3))
+    force[:, 1] = 1.0
+    weights = np.ones(20)
+    weights[8:12] = 0.0
+    points, _ = stepped(force, weights)
+    assert points[8:12, 1].min() > 0.7
+    points, rest = stepped(50.0 * force, limit=0.5)
+    assert np.linalg.norm(points - rest, axis=1).max() == pytest.approx(0.5)
+
+
+def test_lengths_are_pulled_back_with_the_root_held():
+    generator = np.random.default_rng(1)
+    rest, offsets = line()
+    lengths = segment_lengths(rest, offsets)
+    assert lengths.tolist() == [2.0] * 19 + [0.0]
+    points = rest + generator.normal(0, 0.15, rest.shape)
+    points[0] = rest[0]
+    keep_lengths(points, offsets, lengths, 60)
+    np.testing.assert_array_equal(points[0], rest[0])
+    np.testing.assert_allclose(segment_lengths(points, offsets)[:-1], 2.0, rtol=5e-3)
+
+
+def test_points_are_pushed_off_the_head_but_roots(head):
+    generator = np.random.default_rng(2)
+    inside = generator.normal(size=(40, 3))
+    inside *= (37.0 + generator.uniform(0, 6.0, (40, 1))) / np.linalg.norm(inside, axis=1, keepdims=True)
+    offsets = np.arange(0, 41, 4)
+    boundary = Boundary(head, 0.0, 0.6)
+    assert (boundary.look(inside) == 1.0).all()
+    pushed = inside.copy()
+    boundary.push(pushed, offsets)
+    free = np.ones(40, bool)
+    free[offsets[:-1]] = False
+    np.testing.assert_array_equal(pushed[~free], inside[~free])
+    assert head.signed_distance(pushed[free]).min() > MARGIN - 0.1
+    far = head.signed_distance(inside) > MARGIN + 0.02
+    np.testing.assert_allclose(pushed[far & free], inside[far & free], atol=1e-6)
+    cleared, count = boundary.clear(inside, offsets)
+    assert head.signed_distance(cleared[free]).min() > 0
+    assert count == np.count_nonzero(head.signed_distance(inside[free]) < 0.5 * MARGIN)
+
+
+def test_what_the_net_hides_fades_in_over_a_voxel(head):
+    heights = np.array([0.0, 1.0, 1.7, 2.0, 2.15, 2.4, 5.0])
+    points = (40.0 + heights)[:, None] * np.array([0.0, 0.0, 1.0])
+    shown = Boundary(head, 2.0, 0.6).look(points)
+    np.testing.assert_allclose(shown, np.clip((heights - 2.0) / 0.6 + 0.5, 0, 1), atol=0.1)
+
+
+def helix(radius=4.0, pitch=12.0, turns=4):
+    s = np.linspace(0, 2 * np.pi * turns, 400)
+    return np.stack([radius * np.cos(s), radius * np.sin(s), pitch * s / (2 * np.pi)], axis=1)
+
+
+def test_a_helix_survives_control_points_and_back():
+    strands = Strands.from_polylines([helix().astype(np.float32), np.linspace([0, 0, 0], [0, 0, 80], 300, dtype=np.float32)])
+    points, offsets = control_points(strands, 64)
+    # more points where there are turns, and the ends stay
+    counts = np.diff(offsets)
+    assert 36 <= counts[0] <= 64 and counts[1] == 15
+    np.testing.assert_allclose(points[offsets[:-1]], strands.roots, atol=1e-5)
+    fine, fine_offsets = polylines(points, offsets)
+    assert ((np.diff(fine_offsets) >= 16) & (np.diff(fine_offsets) <= 128)).all()
+    back = fine[: fine_offsets[1]]
+    off = np.abs(np.hypot(back[:, 0], back[:, 1]) - 4.0)
+    assert off[6:-6].max() < 0.03 and off.max() < 0.2  # at the ends a neighbour is missing
+    np.testing.assert_allclose(fine[fine_offsets[1:] - 1], strands.tips, atol=1e-4)
+    few, few_offsets = control_points(strands, 8)
+    assert np.diff(few_offsets).tolist() == [8, 8] and len(few) == 16
+
+
+def test_the_pyramid_is_coarsest_first_and_each_level_a_rendering_of_its_own_blur():
+    values = BrickVolume.from_dense(np.ones((64, 64, 64), np.float32), 0.4, (1.0, 2.0, 3.0))
+    points = np.linspace([8.0, 20.0, 30.0], [56.0, 44.0, 34.0], 12)
+    offsets, visible = np.array([0, 12]), np.ones(12)
+    density = BrickVolume(values.table, render(points, offsets, visible, values, 0.85), 0.4, values.origin)
+    levels = pyramid(density, 0.85, 1.6)
+    assert [level.scan.spacing for level in levels] == pytest.approx([1.6, 0.8, 0.4])
+    assert levels[-1].scan is density and levels[-1].blur == 0.85
+    for level in levels[:-1]:
+        here = level.scan.to_voxel(density.to_scan(points))
+        gain = (0.4 / level.scan.spacing) ** 2  # the same line mass over a larger voxel
+        expected = gain * render(here, offsets, visible, level.scan, level.blur)
+        assert np.abs(level.scan.bricks - expected).max() < 0.08 * expected.max()
+        assert level.scan.bricks.sum() == pytest.approx(expected.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize(("iterations", "levels"), [(60, 1), (60, 3), (7, 3), (0, 3), (1, 4)])
+def test_the_iterations_are_shared_out_whole(iterations, levels):
+    found = shares(iterations, levels)
+    assert len(found) == levels and sum(found) == iterations and min(found) >= 0
+    assert found[-1] >= iterations // 2

@@ -1,0 +1,189 @@
+"""Strands rendered into bricks: mass, peak, scipy's own blur; the misfit by hand, its slope by finite differences."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numba
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from ct2hair_addon.refinement.motion import gather_forces
+from ct2hair_addon.refinement.splat import (
+    SPLAT_VARIANCE,
+    _fit_bricks,
+    blurred,
+    gaussian_taps,
+    halved,
+    misfit,
+    render,
+    splat_taps,
+)
+from ct2hair_addon.volume import BrickVolume
+
+BLUR = 0.85
+
+
+def full(shape=(48, 48, 48)) -> BrickVolume:
+    """A volume that has all its bricks."""
+    return BrickVolume.from_dense(np.ones(shape, np.float32), 1.0)
+
+
+def dense_of(volume, bricks):
+    return BrickVolume(volume.table, bricks, 1.0, np.zeros(3)).block((0, 0, 0), volume.shape)
+
+
+def curves(seed=0, count=4):
+    """Wavy strands of nine control points inside 48^3: points (M, 3) float64 voxels, offsets, all visible."""
+    generator = np.random.default_rng(seed)
+    start, end = generator.uniform(8, 16, (count, 3)), generator.uniform(30, 40, (count, 3))
+    t = np.linspace(0, 1, 9)[None, :, None]
+    points = (start[:, None] * (1 - t) + end[:, None] * t + generator.normal(0, 1.0, (count, 9, 3))).reshape(-1, 3)
+    return points, 9 * np.arange(count + 1, dtype=np.int64), np.ones(len(points))
+
+
+def catmull_rom(points, per_segment=400):
+    """Points on the cubics of one strand, finely, ends mirrored."""
+    padded = np.concatenate([[2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]])
+    t = ((np.arange(per_segment) + 0.5) / per_segment)[:, None]
+    parts = []
+    for a, b, c, d in zip(padded[:-3], padded[1:-2], padded[2:-1], padded[3:], strict=True):
+        parts.append(0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - 3 * c + d - a) * t**3))
+    return np.concatenate(parts)
+
+
+def test_the_volume_holds_the_strands_length():
+    points, offsets, visible = curves()
+    found = render(points, offsets, visible, full(), BLUR)
+    fine = [catmull_rom(points[a:b]) for a, b in pairwise(offsets)]
+    length = sum(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in fine)
+    assert found.sum() == pytest.approx(length, rel=2e-3)
+    half = render(points, offsets, 0.5 * visible, full(), BLUR)
+    np.testing.assert_allclose(half, 0.5 * found, atol=1e-6)
+
+
+def test_a_strand_is_a_sum_of_gaussians_along_it():
+    points, offsets, visible = curves(1, 1)
+    found = dense_of(full(), render(points, offsets, visible, full(), BLUR))
+    line = catmull_rom(points, 60)
+    middle, step = 0.5 * (line[1:] + line[:-1]), np.linalg.norm(np.diff(line, axis=0), axis=1)
+    x, y, z = (np.exp(-0.5 * ((np.arange(48)[None] - middle[:, axis, None]) / BLUR) ** 2) for axis in range(3))
+    expected = np.einsum("p,pi,pj,pk->ijk", step / (BLUR * np.sqrt(2 * np.pi)) ** 3, x, y, z, optimize=True)
+    # the splat's own width swings between 0 and 1/2 voxel with the place between voxels, and by a blur more that is gone
+    assert np.abs(found - expected).max() < 0.25 * expected.max()
+    soft, expected = ndimage.gaussian_filter(found.astype(float), 1.5), ndimage.gaussian_filter(expected, 1.5)
+    assert np.abs(soft - expected).max() < 0.03 * expected.max()
+
+
+@pytest.mark.parametrize("direction", [(1, 0.3, 0.2), (0.1, 0.4, 1), (1, 1, 0.5)])
+def test_a_lone_straight_strand_is_as_high_on_its_axis_as_it_should(direction):
+    direction = np.array(direction) / np.linalg.norm(direction)
+    points = 24.0 + np.linspace(-20, 20, 9)[:, None] * direction
+    volume = full()
+    shown = BrickVolume(volume.table, render(points, np.array([0, 9]), np.ones(9), volume, BLUR), 1.0, np.zeros(3))
+    axis = shown.sample(24.0 + np.linspace(-10, 10, 200)[:, None] * direction).mean()
+    # reading between voxels widens it by another sixth
+    assert axis == pytest.approx(1.0 / (2 * np.pi * (BLUR**2 + 1 / 6)), rel=0.03)
+
+
+def test_bricks_that_are_not_there_get_nothing_and_the_others_the_same():
+    points, offsets, visible = curves(2)
+    whole = full()
+    everywhere = dense_of(whole, render(points, offsets, visible, whole, BLUR))
+    some = np.ones((48, 48, 48), np.float32)
+    some[16:32, 16:32, 16:32] = 0.0
+    holed = BrickVolume.from_dense(some, 1.0)
+    found = dense_of(holed, render(points, offsets, visible, holed, BLUR))
+    np.testing.assert_array_equal(found[some > 0], everywhere[some > 0])
+    assert not found[some == 0].any()
+
+
+def test_threads_change_no_bit():
+    points, offsets, visible = curves(3, 40)
+    before = numba.get_num_threads()
+    many = render(points, offsets, visible, full(), BLUR)
+    try:
+        numba.set_num_threads(1)
+        one = render(points, offsets, visible, full(), BLUR)
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(many, one)
+
+
+def test_taps_are_normalised_and_leave_room_for_the_splat():
+    np.testing.assert_allclose([gaussian_taps(0.85).sum(), splat_taps(0.85).sum()], 1.0, rtol=1e-6)
+    assert gaussian_taps(0.0).tolist() == [0, 0, 0, 1, 0, 0, 0]
+    offsets = np.arange(-3, 4)
+    assert (splat_taps(0.85) * offsets**2).sum() + 1 / 6 == pytest.approx(0.85**2, rel=0.02)
+
+
+def test_blurred_is_scipys_gaussian_across_brick_borders():
+    values = np.random.default_rng(4).normal(size=(40, 33, 50)).astype(np.float32)
+    volume = BrickVolume.from_dense(values, 1.0)
+    found = dense_of(volume, blurred(volume, BLUR))[:40, :33, :50]
+    expected = ndimage.convolve1d(values.astype(float), gaussian_taps(BLUR), 0, mode="constant")
+    for axis in (1, 2):
+        expected = ndimage.convolve1d(expected, gaussian_taps(BLUR), axis, mode="constant")
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_halved_are_means_of_8_in_the_same_frame():
+    values = np.random.default_rng(5).normal(size=(48, 16, 80)).astype(np.float32)
+    volume = BrickVolume.from_dense(values, 0.5, (3.0, -2.0, 7.0))
+    coarse = halved(volume)
+    expected = values.reshape(24, 2, 8, 2, 40, 2).mean(axis=(1, 3, 5))
+    np.testing.assert_allclose(coarse.block((0, 0, 0), (24, 8, 40)), expected, atol=1e-6)
+    assert coarse.spacing == 1.0
+    # the middle of the first eight voxels
+    np.testing.assert_allclose(coarse.to_scan([[0, 0, 0]]), volume.to_scan([[0.5, 0.5, 0.5]]))
+
+
+def test_the_misfit_is_what_the_formula_says():
+    points, offsets, visible = curves(6)
+    target = BrickVolume.from_dense(np.random.default_rng(6).normal(0.1, 0.05, (48, 48, 48)).astype(np.float32), 1.0)
+    gain = 0.7
+    out = np.empty_like(target.bricks)
+    error = misfit(points, offsets, visible, target, BLUR, gain, out)
+    model = gain * render(points, offsets, visible, target, BLUR).astype(np.float64)
+    weight = 1.0 / (1.0 + model / (gain / (2 * np.pi * BLUR**2)))
+    np.testing.assert_allclose(out, weight * (model - target.bricks), atol=1e-5)
+    assert error == pytest.approx(0.5 * (weight * (model - target.bricks) ** 2).sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize("direction", [(0, 1, 0), (0.6, 0, 0.8)])
+def test_forces_are_the_misfits_slope_by_finite_differences(direction):
+    """A straight strand beside the scan's, moved as a whole, askew to the lattice; all weights 1, so the slope is exact."""
+    along = np.array([1.0, 0.31, -0.22]) / np.linalg.norm([1.0, 0.31, -0.22])
+    truth = 24.0 + np.linspace(-18, 18, 10)[:, None] * along
+    offsets, visible = np.array([0, 10]), np.ones(10)
+    scan = full()
+    gain = 0.8
+    target = BrickVolume(scan.table, gain * render(truth, offsets, visible, scan, BLUR), 1.0, np.zeros(3))
+    across = np.array(direction, float) - (direction @ along) * along
+    across /= np.linalg.norm(across)
+    points = truth + 0.7 * across
+    out, potential = np.empty_like(target.bricks), np.empty_like(target.bricks)
+
+    def error(step):
+        # a peak that is never reached: all weights are 1
+        return _fit_bricks(points + step * across, offsets, visible, target, BLUR, gain, 1e12, out, lambda *_: None)
+
+    slope = (error(0.1) - error(-0.1)) / 0.2
+    error(0.0)
+    assert slope > 0  # farther off is worse
+    forces, weights = np.empty_like(points), np.empty(10)
+    length = np.full(10, 4.0)
+    length[[0, -1]] = 2.0
+
+    def from_forces(blur):
+        blurred(BrickVolume(target.table, out, 1.0, np.zeros(3)), blur, potential)
+        gather_forces(points, offsets, visible, target.table, potential, forces, weights)
+        np.testing.assert_allclose(weights, 1.0)
+        assert np.abs(forces @ along).max() < 1e-6  # nothing along the strand
+        return -gain * (length * (forces @ across)).sum()
+
+    # reading between voxels is part of the blur, as the splat is: then the force is the slope
+    assert from_forces(np.sqrt(BLUR**2 - SPLAT_VARIANCE)) == pytest.approx(slope, rel=0.05)
+    # under the whole blur, as the fit takes it, it is up to a quarter softer
+    assert 0.75 * slope < from_forces(BLUR) < slope
