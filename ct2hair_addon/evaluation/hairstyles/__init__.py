@@ -10,8 +10,9 @@ from ...head import HeadMesh, template_head
 from ...strands import Strands
 from .loose import LOOSE
 from .person import person
+from .tied import TIED
 
-_RECIPES = dict(LOOSE)
+_RECIPES = {**LOOSE, **TIED}
 
 STYLES = tuple(_RECIPES)
 """The names that `hairstyle` takes."""
