@@ -1,4 +1,4 @@
-"""Who wears the hair: the roots on a scalp, its landmarks, its distance field with shoulders, and the wisps of the roots."""
+"""Who wears the hair: the roots on a scalp, its landmarks, its distance field, and the wisps of the roots."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ ROOM = 60.0
 """How far (mm) the distance field reaches beyond the head; farther off, its outer cells go on."""
 
 LONGEST = 340.0
-"""The field reaches this far (mm) below the top of the scalp, shoulders included."""
-
-SHOULDERS = (-0.62, 0.62, 0.78)
-"""Half width and radius of the shoulders, and their depth under the scalp's lowest point, in heights of the scalp."""
+"""The field reaches this far (mm) below the top of the scalp."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def person(mesh: HeadMesh, strands: int, seed: int) -> Person:
         on.position.astype(np.float64),
         on.normal.astype(np.float64),
         on.uv,
-        _with_shoulders(field, middle, low[2], unit),
+        field,
         float(unit),
         middle,
         float(0.5 * (high[0] - low[0])),
@@ -111,18 +108,6 @@ def person(mesh: HeadMesh, strands: int, seed: int) -> Person:
         float(high[1]),
         float(hairline),
     )
-
-
-def _with_shoulders(field: DistanceField, middle: np.ndarray, nape: float, unit: float) -> DistanceField:
-    """The field with shoulders below the neck, so that long hair has something to fall on."""
-    axes = [field.origin[a] + field.step * np.arange(field.values.shape[a]) for a in range(3)]
-    x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
-    # a level capsule, drooping outwards
-    across = np.abs(x - middle[0])
-    drop = nape - 160.0 * unit - 0.25 * np.maximum(across - 50.0 * unit, 0.0)
-    beyond = np.maximum(across - 150.0 * unit, 0.0)
-    away = np.sqrt(beyond**2 + (0.9 * (y - middle[1] - 10.0 * unit)) ** 2 + (z - drop) ** 2) - 50.0 * unit
-    return DistanceField(np.minimum(field.values, away.astype(np.float32)), field.step, field.origin)
 
 
 @dataclass(frozen=True)

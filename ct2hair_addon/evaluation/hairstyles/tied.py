@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...strands import Strands
 from .growth import CLEARANCE, bundle, clump, drape, grow, pull, settle
@@ -195,7 +196,7 @@ def _hanging(who: Person, tie: Tie, rise: float, stiff: float, length: float, cl
         tie.axes[2:],
         unit_rows(tie.axes[2:] + [0.0, 0.0, rise]),
         stiff * unit * one,
-        one / (0.75 * stiff * unit),
+        one / (1.05 * stiff * unit),
         0.6 * stiff * unit * one,
         length * unit * one,
         clear * unit * one,
@@ -224,8 +225,6 @@ def _swaying(tie: Tie, groups: int, generator: np.random.Generator, wide: float,
 
 def _groups(tie: Tie, count: int) -> np.ndarray:
     """(N,) int64: which of `count` wisps, even in area, each place of the tie belongs to."""
-    from scipy.spatial import cKDTree
-
     n = np.arange(count) + 0.5
     turn = np.pi * (1.0 + 5.0**0.5) * n  # a sunflower's seeds lie evenly in a disc
     seeds = np.sqrt(n / count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -251,10 +250,9 @@ def ponytail(who: Person, seed: int) -> Strands:
     fly = generator.random(count) < 0.02
     drift *= np.where(fly, 3.0, 0.6 + 0.5 * outer)[:, None]
     tails = np.empty((count, TAIL_POINTS, 3))
-    bundle(
-        centre, first, second, spacing, swell[None], np.zeros(count, np.int64), tie.across, np.clip(length, 90.0 * unit, 328.0 * unit),
-        np.zeros(count), drift, _swaying(tie, groups, generator, 1.6, 0.5, unit), tails,
-    )  # fmt: skip
+    length = np.clip(length, 90.0 * unit, 328.0 * unit)
+    sway, whole = _swaying(tie, groups, generator, 1.6, 0.5, unit), np.zeros(count, np.int64)
+    bundle(centre, first, second, spacing, swell[None], whole, tie.across, length, np.zeros(count), drift, sway, tails)
     lead = np.zeros(groups, np.int64)
     lead[group[::-1]] = np.arange(count)[::-1]
     wisped = np.empty_like(tails)
@@ -265,17 +263,17 @@ def ponytail(who: Person, seed: int) -> Strands:
 def braid(who: Person, seed: int) -> Strands:
     """Hair drawn back to the nape and plaited in three, with a tuft below the last tie."""
     generator, unit, count = _random(who, seed), who.unit, len(who.roots)
-    tie = gather(who, -8.0, generator, taut=0.8)
+    tie = gather(who, 0.0, generator, taut=0.8)
     plaited, tuft = 215.0, 60.0
     s = np.linspace(0.0, plaited + tuft, 600)
-    middle, spacing = _even(_hanging(who, tie, 0.0, 32.0, plaited + tuft, 24.0)[None], 600)
+    middle, spacing = _even(_hanging(who, tie, 0.0, 32.0, plaited + tuft, 30.0)[None], 600)
     first, second = _frames(middle, tie.axes[0])
 
     # hair of different lengths thins out: all sizes follow the root of what is left
     left = np.sqrt(1.0 - 0.6 * np.clip(s / plaited, 0.0, 1.0))
-    phase = 0.5 * np.pi + np.cumsum(2.0 * np.pi / (92.0 * left)) * (s[1] - s[0])
-    begin, end = _smooth(s / 25.0), 1.0 - _smooth((s - plaited + 22.0) / 20.0)
-    wide, deep = 15.0 * left * end * unit, 11.5 * left * end * unit
+    phase = 0.5 * np.pi + np.cumsum(2.0 * np.pi / (104.0 * left)) * (s[1] - s[0])
+    end = 1.0 - _smooth((s - plaited + 22.0) / 20.0)
+    wide, deep = 18.0 * left * end * unit, 14.0 * left * end * unit
     third = phase[None] + 2.0 * np.pi / 3.0 * np.arange(3)[:, None]
     lines = middle + (wide * np.sin(third))[..., None] * first + (deep * np.sin(2.0 * third))[..., None] * second
     lines, spacings = _even(lines, 600)
@@ -288,11 +286,10 @@ def braid(who: Person, seed: int) -> Strands:
     part = np.mod(np.floor(angle / (2.0 * np.pi / 3.0) + 0.5).astype(np.int64), 3)
     inside = np.linalg.norm(tie.across, axis=1) / (TIE_RADIUS * unit)
     turned = 3.0 * (angle - part * 2.0 * np.pi / 3.0)
-    across = (10.6 * unit * inside)[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
-    share = np.clip(1.0 - 0.6 * generator.random(count), 0.0, 1.0)
-    ends = np.where(generator.random(count) < 0.4, plaited + tuft * generator.uniform(0.35, 1.0, count) ** 0.7, plaited * share**0)
-    early = ends <= plaited
-    ends = np.where(early, plaited * generator.uniform(0.15, 1.0, count), ends)
+    across = (12.2 * unit * inside)[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    lasting = generator.random(count) < 0.4
+    ends = plaited * generator.uniform(0.15, 1.0, count)
+    ends = np.where(lasting, plaited + tuft * generator.uniform(0.35, 1.0, count) ** 0.7, ends)
     fly = generator.random(count) < 0.015
     stretch = (spacings / spacing[0])[part]
     none = np.zeros((count, 2))
@@ -300,10 +297,11 @@ def braid(who: Person, seed: int) -> Strands:
     sway[..., 1] *= 0.6
     sway[fly, :, 0] *= 6.0
     straight, plait = np.empty((count, TAIL_POINTS + 60, 3)), np.empty((count, TAIL_POINTS + 60, 3))
-    bundle(middle, first, second, spacing, np.ones((1, 600)), np.zeros(count, np.int64), tie.across, ends * unit, np.zeros(count), none, sway, straight)  # fmt: skip
-    bundle(lines, one, two, spacings, swell, part, across, ends * unit * stretch, np.zeros(count), none, sway, plait)
+    untwisted, whole = np.zeros(count), np.zeros(count, np.int64)
+    bundle(middle, first, second, spacing, np.ones((1, 600)), whole, tie.across, ends * unit, untwisted, none, sway, straight)
+    bundle(lines, one, two, spacings, swell, part, across, ends * unit * stretch, untwisted, none, sway, plait)
     along = ends[:, None] * np.linspace(0.0, 1.0, TAIL_POINTS + 60)
-    weight = _smooth(along / 28.0)[..., None]
+    weight = _smooth(along / 40.0)[..., None]
     return finished(who, tie, straight + weight * (plait - straight), 160, generator)
 
 
@@ -312,19 +310,17 @@ def bun(who: Person, seed: int) -> Strands:
     generator, unit, count = _random(who, seed), who.unit, len(who.roots)
     tie = gather(who, 34.0, generator)
     turns = np.linspace(0.0, 1.32, 400)
-    out = 29.0 * _smooth(turns / 0.24)
-    high = 15.0 * _smooth(turns / 0.14) - 27.0 * _smooth((turns - 0.16) / 0.75)
+    out = 34.0 * _smooth(turns / 0.36)
+    high = 24.0 * _smooth(turns / 0.22) - 32.0 * _smooth((turns - 0.2) / 0.75)
     angle = 2.0 * np.pi * turns
-    lines = tie.centre + unit * (
-        (out * np.cos(angle))[:, None] * tie.axes[0] + (out * np.sin(angle))[:, None] * tie.axes[1] + high[:, None] * tie.axes[2]
-    )
+    lines = tie.centre + unit * np.stack([out * np.cos(angle), out * np.sin(angle), high], axis=1) @ tie.axes
     lines, spacing = _even(lines[None], 400)
     whole = spacing[0] * 399
     first, second = _frames(lines, tie.axes[0])
     s = np.linspace(0.0, 1.0, 400)
     ends = whole * (1.0 - 0.75 * generator.random(count) ** 1.1)
-    left = np.sqrt((ends[None] >= (s * whole)[:, None]).mean(axis=1)) if count < 2000 else _left(ends, whole)
-    swell = np.maximum(left, 0.3) * (1.0 - 0.08 * _smooth(s / 0.2))
+    left = np.sqrt(1.0 - np.searchsorted(np.sort(ends), s * whole) / count)
+    swell = np.maximum(left, 0.3) * (1.0 + 0.15 * _smooth(s / 0.3))
     groups = 60
     drift = 0.4 * generator.normal(size=(groups, 2))[_groups(tie, groups)] * unit
     fly = generator.random(count) < 0.02
@@ -337,11 +333,6 @@ def bun(who: Person, seed: int) -> Strands:
         np.full(count, 2.0 * np.pi / (95.0 * unit)), drift, sway, tails,
     )  # fmt: skip
     return finished(who, tie, tails, 144, generator)
-
-
-def _left(ends: np.ndarray, whole: float) -> np.ndarray:
-    """(400,) root of the share of strands that reach each place."""
-    return np.sqrt(1.0 - np.searchsorted(np.sort(ends), np.linspace(0.0, whole, 400)) / len(ends))
 
 
 def _smooth(x: np.ndarray) -> np.ndarray:
