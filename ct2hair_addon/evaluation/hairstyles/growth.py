@@ -100,7 +100,10 @@ def clump(courses, length, guide, strength, power, out):
                 course = courses[lead, low, axis] * (1.0 - t) + courses[lead, low + 1, axis] * t
                 if at > count - 1:
                     # beyond the guide's tip: go on beside it
-                    course += courses[n, p, axis] - courses[n, min(int((count - 1) / ratio), count - 1), axis]
+                    left = (count - 1) / ratio
+                    under = min(int(left), count - 2)
+                    beside = courses[n, under, axis] + (left - under) * (courses[n, under + 1, axis] - courses[n, under, axis])
+                    course += courses[n, p, axis] - beside
                 out[n, p, axis] = courses[n, p, axis] + weight * (course - courses[n, p, axis])
 
 
@@ -118,7 +121,8 @@ def curl(courses, radius, wavelength, phase, flat, ramp, across, out):
         tangent = np.zeros(3)
         s = 0.0
         for p in range(count):
-            a, b = max(p - 1, 0), min(p + 1, count - 1)
+            # over some points: where a wisp's strands meet, two can all but coincide
+            a, b = max(p - 3, 0), min(p + 3, count - 1)
             norm = 0.0
             for axis in range(3):
                 tangent[axis] = courses[n, b, axis] - courses[n, a, axis]
@@ -178,7 +182,8 @@ def settle(courses, values, step, origin, clearance, smoothing):
 
 @numba.njit(cache=True, parallel=True)
 def cut(courses, height, shortest, out):
-    """Cut each course (N, P, 3) where it first falls below `height` (N,) mm (z), but not shorter than `shortest` (N,) mm.
+    """Cut each course (N, P, 3) where it first falls below `height` (N,) mm (z), but not shorter than `shortest` (N,) mm;
+    one that is rooted below is cut to that.
 
     `out` (N, P, 3): what is left, at points of equal arc length.
     """
@@ -189,6 +194,8 @@ def cut(courses, height, shortest, out):
             d = courses[n, p] - courses[n, p - 1]
             arc[p] = arc[p - 1] + np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         end = arc[count - 1]
+        if courses[n, 0, 2] < height[n]:
+            end = min(shortest[n], end)
         for p in range(1, count):
             a, b = courses[n, p - 1, 2], courses[n, p, 2]
             if b < height[n] and a >= height[n]:

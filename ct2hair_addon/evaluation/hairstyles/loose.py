@@ -245,7 +245,7 @@ def mop_top(who: Person, seed: int) -> Strands:
     growth.length = 120.0 + 90.0 * who.height
     growth.layer = 4.0 + 9.0 * who.height
     growth.gravity, growth.gravity_length = growth.gravity * 1.6, growth.gravity_length * 0.6
-    growth.lowest = who.brow + 8.0 - (who.brow - who.nape + 24.0 * who.unit) * np.clip(to_back * 1.25, 0.0, 1.0) ** 1.3
+    growth.lowest = who.brow + 8.0 - (who.brow - who.nape + 24.0 * who.unit) * np.clip(to_back * 1.35 - 0.12, 0.0, 1.0) ** 1.3
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.004, 0.4, 0.45, 0.6
     growth.shortest = 28.0
     return styled(who, growth, generator)
@@ -337,7 +337,7 @@ def blowout(who: Person, seed: int) -> Strands:
     growth.radius = np.full(len(parted), 9.0)
     growth.wavelength = np.full(len(parted), 125.0)
     growth.flat, growth.ramp, growth.own_phase, growth.phases = 0.4, 80.0, 0.15, "head"
-    growth.tip, growth.tip_length = 0.6 * who.outward() + [0.0, 0.2, 0.1], growth.tip_length * 45.0
+    growth.tip, growth.tip_length = 0.3 * who.outward() + [0.0, 0.1, 0.05], growth.tip_length * 45.0
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.003, 0.3, 0.5, 0.6
     return styled(who, growth, generator, side)
 
