@@ -25,7 +25,7 @@ CURLED = ("curly", "jewfro", "jheri_curl")
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("styles", nargs="*", help="the styles to picture (default: all)")
-    parser.add_argument("--strands", type=int, default=7000, help="of each style (default: %(default)s)")
+    parser.add_argument("--strands", type=int, default=20000, help="of each style (default: %(default)s)")
     parser.add_argument("--size", type=int, default=260, help="pixels of a view (default: %(default)s)")
     parser.add_argument("--samples", type=int, default=6, help="of Cycles (default: %(default)s)")
     parser.add_argument("--page", action="store_true", help="write the page alone")
@@ -66,8 +66,8 @@ def render(name: str, options: argparse.Namespace) -> None:
                 result, path, view=view, samples=options.samples, size=options.size
             ))  # fmt: skip
             pictures.append(np.asarray(Image.open(path).convert("RGB")))
-    # 128 colours, not dithered, are a third of the bytes and look the same
-    small = Image.fromarray(np.concatenate(pictures, axis=1)).quantize(128, dither=Image.Dither.NONE)
+    # 256 colours are a third of the bytes and look the same
+    small = Image.fromarray(np.concatenate(pictures, axis=1)).quantize(256)
     small.save(OUT / f"{name}.png", optimize=True)
 
 

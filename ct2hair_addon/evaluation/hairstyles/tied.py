@@ -164,7 +164,8 @@ def _turn(angle: np.ndarray) -> np.ndarray:
 def _along(field, start: np.ndarray, ray: np.ndarray) -> float:
     """mm from `start` inside the head along `ray` to the skin."""
     reach = np.arange(20.0, 250.0, 0.25)
-    return float(reach[np.argmax(field.sample(start + reach[:, None] * ray) > 0.0)])
+    # the outermost skin: a head may be hollow
+    return float(reach[np.flatnonzero(field.sample(start + reach[:, None] * ray) <= 0.0)[-1]])
 
 
 def _frames(centre: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -257,7 +258,7 @@ def ponytail(who: Person, seed: int) -> Strands:
     lead[group[::-1]] = np.arange(count)[::-1]
     wisped = np.empty_like(tails)
     clump(tails, length, lead[group], np.where(fly, 0.0, generator.uniform(0.2, 0.45, count)), 1.6, wisped)
-    return finished(who, tie, wisped, 112, generator)
+    return finished(who, tie, wisped, 176, generator)
 
 
 def braid(who: Person, seed: int) -> Strands:
@@ -320,7 +321,7 @@ def bun(who: Person, seed: int) -> Strands:
     s = np.linspace(0.0, 1.0, 400)
     ends = whole * (1.0 - 0.75 * generator.random(count) ** 1.1)
     left = np.sqrt(1.0 - np.searchsorted(np.sort(ends), s * whole) / count)
-    swell = np.maximum(left, 0.3) * (1.0 + 0.15 * _smooth(s / 0.3))
+    swell = np.maximum(left, 0.3) * (1.0 + 0.3 * _smooth(s / 0.3))
     groups = 60
     drift = 0.4 * generator.normal(size=(groups, 2))[_groups(tie, groups)] * unit
     fly = generator.random(count) < 0.02
