@@ -100,7 +100,10 @@ def clump(courses, length, guide, strength, power, out):
                 course = courses[lead, low, axis] * (1.0 - t) + courses[lead, low + 1, axis] * t
                 if at > count - 1:
                     # beyond the guide's tip: go on beside it
-                    course += courses[n, p, axis] - courses[n, min(int((count - 1) / ratio), count - 1), axis]
+                    left = (count - 1) / ratio
+                    under = min(int(left), count - 2)
+                    beside = courses[n, under, axis] + (left - under) * (courses[n, under + 1, axis] - courses[n, under, axis])
+                    course += courses[n, p, axis] - beside
                 out[n, p, axis] = courses[n, p, axis] + weight * (course - courses[n, p, axis])
 
 
@@ -118,7 +121,8 @@ def curl(courses, radius, wavelength, phase, flat, ramp, across, out):
         tangent = np.zeros(3)
         s = 0.0
         for p in range(count):
-            a, b = max(p - 1, 0), min(p + 1, count - 1)
+            # over some points: where a wisp's strands meet, two can all but coincide
+            a, b = max(p - 3, 0), min(p + 3, count - 1)
             norm = 0.0
             for axis in range(3):
                 tangent[axis] = courses[n, b, axis] - courses[n, a, axis]
@@ -178,7 +182,8 @@ def settle(courses, values, step, origin, clearance, smoothing):
 
 @numba.njit(cache=True, parallel=True)
 def cut(courses, height, shortest, out):
-    """Cut each course (N, P, 3) where it first falls below `height` (N,) mm (z), but not shorter than `shortest` (N,) mm.
+    """Cut each course (N, P, 3) where it first falls below `height` (N,) mm (z), but not shorter than `shortest` (N,) mm;
+    one that is rooted below is cut to that.
 
     `out` (N, P, 3): what is left, at points of equal arc length.
     """
@@ -189,6 +194,8 @@ def cut(courses, height, shortest, out):
             d = courses[n, p] - courses[n, p - 1]
             arc[p] = arc[p - 1] + np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         end = arc[count - 1]
+        if courses[n, 0, 2] < height[n]:
+            end = min(shortest[n], end)
         for p in range(1, count):
             a, b = courses[n, p - 1, 2], courses[n, p, 2]
             if b < height[n] and a >= height[n]:
@@ -206,10 +213,10 @@ def cut(courses, height, shortest, out):
 
 
 @numba.njit(cache=True, parallel=True)
-def pull(courses, values, step, origin, layer, rounds):
+def pull(courses, values, step, origin, height, rounds):
     """Pull courses (N, P, 3) taut over the head, in place, both ends held: the way of hair that is tied up.
 
-    layer: (N,) mm over the skin that the strand lies at by its end.
+    height: (N, P) mm over the skin that the points keep: what hair already lies beneath. Hollows are bridged.
     """
     count = courses.shape[1]
     for n in numba.prange(len(courses)):
@@ -219,7 +226,59 @@ def pull(courses, values, step, origin, layer, rounds):
                 courses[n, p] = 0.5 * (courses[n, p - 1] + courses[n, p + 1])
                 x, y, z = courses[n, p, 0], courses[n, p, 1], courses[n, p, 2]
                 distance = distance_and_normal(values, step, origin, x, y, z, normal)
-                share = p / (count - 1)
-                wanted = min(layer[n] * share + CLEARANCE, 20.0 * share)
-                if distance < wanted:
-                    courses[n, p] += normal * (wanted - distance)
+                if distance < height[n, p]:
+                    courses[n, p] += normal * (height[n, p] - distance)
+
+
+@numba.njit(cache=True, parallel=True)
+def drape(centre, axes, angle, azimuth, height, values, step, origin, out):
+    """Lay courses over the head: `out` (N, P, 3), each point out from `centre` (3,) to its `height` (N, P) mm over the skin.
+
+    axes: (3, 3) rows u, v, w; angle: (N, P) from w, azimuth: (N, P) from u to v, radians.
+    """
+    for n in numba.prange(out.shape[0]):
+        normal = np.zeros(3)
+        ray = np.zeros(3)
+        reach = 80.0
+        for p in range(out.shape[1]):
+            u = np.sin(angle[n, p]) * np.cos(azimuth[n, p])
+            v = np.sin(angle[n, p]) * np.sin(azimuth[n, p])
+            ray[:] = u * axes[0] + v * axes[1] + np.cos(angle[n, p]) * axes[2]
+            for _ in range(12):
+                x, y, z = centre[0] + reach * ray[0], centre[1] + reach * ray[1], centre[2] + reach * ray[2]
+                distance = distance_and_normal(values, step, origin, x, y, z, normal)
+                rise = max(ray[0] * normal[0] + ray[1] * normal[1] + ray[2] * normal[2], 0.4)
+                reach += (height[n, p] - distance) / rise
+                if abs(height[n, p] - distance) < 0.01:
+                    break
+            out[n, p] = centre + reach * ray
+
+
+@numba.njit(cache=True, parallel=True)
+def bundle(centre, first, second, spacing, swell, which, across, length, twist, drift, sway, out):
+    """Lay strands along the centre lines of bundles, side by side and square to them: `out` (N, P, 3).
+
+    centre, first, second: (K, Q, 3) points `spacing` (K,) mm apart and the two directions across; swell: (K, Q) factor on
+    `across` (N, 2) mm. which: (N,) the bundle; length: (N,) mm of the centre line that the strand goes along; twist: (N,)
+    radians a mm; drift: (N, 2) mm gained sideways over each 100 mm; sway: (N, 2, 3) amplitude (mm, reached after 40 mm),
+    wavelength, phase of a strand's own bends.
+    """
+    count, last = out.shape[1], centre.shape[1] - 2
+    for n in numba.prange(len(out)):
+        k = which[n]
+        for p in range(count):
+            s = length[n] * p / (count - 1)
+            low = min(int(s / spacing[k]), last)
+            t = s / spacing[k] - low
+            size = swell[k, low] + t * (swell[k, low + 1] - swell[k, low])
+            c, d = np.cos(twist[n] * s), np.sin(twist[n] * s)
+            a = size * (across[n, 0] * c - across[n, 1] * d) + drift[n, 0] * s / 100.0
+            b = size * (across[n, 0] * d + across[n, 1] * c) + drift[n, 1] * s / 100.0
+            grown = 1.0 - np.exp(-((s / 40.0) ** 2))
+            a += grown * sway[n, 0, 0] * np.sin(2.0 * np.pi * s / sway[n, 0, 1] + sway[n, 0, 2])
+            b += grown * sway[n, 1, 0] * np.sin(2.0 * np.pi * s / sway[n, 1, 1] + sway[n, 1, 2])
+            for axis in range(3):
+                middle = centre[k, low, axis] + t * (centre[k, low + 1, axis] - centre[k, low, axis])
+                one = first[k, low, axis] + t * (first[k, low + 1, axis] - first[k, low, axis])
+                two = second[k, low, axis] + t * (second[k, low + 1, axis] - second[k, low, axis])
+                out[n, p, axis] = middle + a * one + b * two

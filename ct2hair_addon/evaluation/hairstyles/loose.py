@@ -24,9 +24,9 @@ class Growth:
     start, comb: (N, 3) unit: first direction, and where it is combed to over comb_length. gravity: 1/mm: how fast hair
     turns down, from gravity_length on. length; layer: height over the skin that it lies at; tip (N, 3), tip_length: a turn of
     the ends. sway (1/mm), sway_length: a wisp's own bends; stray: a strand's own, as a share. wisp, lock: 0 to 1, how far the
-    two kinds of wisps close at the tips. radius, wavelength, flat, ramp: curls (radius 0: none), own_phase: how much a strand's
-    phase differs from its
-    wisp's. lowest: z of the cut; shortest: mm kept at least. points: of each strand.
+    two kinds of wisps close at the tips, lock_power: how late locks do. radius, wavelength, flat, ramp: curls (radius 0:
+    none), own_phase: how much a strand's phase differs from its wisp's; phases: whether curls keep time over the `head`
+    (waves), by `wisp`, or not (each `lock` a ringlet). lowest: z of the cut; shortest: mm kept at least. points: of a strand.
     """
 
     start: np.ndarray
@@ -49,6 +49,8 @@ class Growth:
     stray: float = 0.5
     wisp: float = 0.45
     lock: float = 0.6
+    lock_power: float = 0.8
+    phases: str = "wisp"
     flyaways: float = 0.03
     shortest: float = 10.0
     points: int = 64
@@ -144,21 +146,25 @@ def styled(who: Person, growth: Growth, generator: np.random.Generator, side: np
     )
     gathered = np.empty_like(courses)
     free = np.where(fly, 0.25, 1.0)
-    clump(courses, length, small.lead, growth.lock * free * generator.uniform(0.7, 1.0, count), 0.8, gathered)
+    clump(courses, length, small.lead, growth.lock * free * generator.uniform(0.7, 1.0, count), growth.lock_power, gathered)
     clump(gathered, length, large.lead, growth.wisp * free * large.uniform(generator, 0.5, 1.0), 1.4, courses)
     if (growth.radius > 0.0).any():
         wound = np.empty_like(courses)
-        handed = np.where(large.uniform(generator) < 0.5, -1.0, 1.0)
+        keeper = small if growth.phases == "lock" else large
+        handed = np.where(keeper.uniform(generator) < 0.5, -1.0, 1.0)
+        phase, across = keeper.uniform(generator, 0.0, 2.0 * np.pi), 0.4
+        if growth.phases == "head":
+            handed, phase, across = np.ones(count), 0.7 * large.shared(generator), 0.12
         curl(
             courses,
             handed * growth.radius * unit * np.exp(0.1 * small.shared(generator) + 0.06 * generator.normal(size=count)),
             growth.wavelength * unit * np.exp(0.06 * large.shared(generator) + 0.05 * small.shared(generator)),
-            large.uniform(generator, 0.0, 2.0 * np.pi)
-            + 0.5 * small.shared(generator)
+            phase
+            + (0.0 if growth.phases == "lock" else 0.4) * small.shared(generator)
             + growth.own_phase * generator.normal(size=count),
             handed * growth.flat,
             np.full(count, growth.ramp * unit),
-            unit_rows(large.shared(generator, 3) * 0.4 + np.cross(who.normals, [0.0, 0.0, 1.0]) + 1e-3),
+            unit_rows(large.shared(generator, 3) * across + np.cross(who.normals, [0.0, 0.0, 1.0]) + 1e-3),
             wound,
         )
         courses = wound
@@ -186,9 +192,10 @@ def bangs(who: Person, seed: int) -> Strands:
     forward = who.along_scalp(np.stack([0.006 * place[:, 0], np.full(len(place), -1.0), np.full(len(place), -0.2)], axis=1))
     growth.comb[fringe] = forward[fringe]
     growth.length = np.where(fringe, 125.0, 255.0 + 15.0 * who.height)
-    growth.layer = np.where(fringe, 4.0 + 9.0 * (1.0 - who.forward) * 3.0, 3.0 + 10.0 * who.height)
-    growth.gravity = np.where(fringe, 0.05, 0.04)
-    growth.gravity_length = np.where(fringe, 15.0, 25.0)
+    growth.layer = np.where(fringe, 2.5 + 15.0 * (1.0 - who.forward), 3.0 + 8.0 * who.height)
+    growth.start = np.where(fringe[:, None], 0.6 * who.normals + growth.comb, growth.start)
+    growth.gravity = np.where(fringe, 0.09, 0.045)
+    growth.gravity_length = np.where(fringe, 8.0, 20.0)
     growth.comb_length = np.where(fringe, 30.0, 45.0)
     growth.lowest = np.where(fringe, who.brow - 2.0 + 0.12 * np.abs(place[:, 0]), who.nape - 105.0 * who.unit)
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.0022, 0.4, 0.3, 0.55
@@ -201,10 +208,10 @@ def bob(who: Person, seed: int) -> Strands:
     growth = straight(who)
     growth.comb, side = comb_from_parting(who, 26.0, 0.05, 1.5 * generator.normal(size=len(who.roots)))
     growth.length = 165.0 + 75.0 * who.height
-    growth.layer = 4.0 + 15.0 * who.height
-    growth.gravity, growth.gravity_length = growth.gravity * 1.1, growth.gravity_length * 0.8
+    growth.layer = 3.0 + 10.0 * who.height
+    growth.gravity, growth.gravity_length = growth.gravity * 1.3, growth.gravity_length * 0.7
     growth.lowest = np.full(len(who.roots), who.chin + 22.0 * who.unit) - 10.0 * who.unit * who.forward
-    growth.tip, growth.tip_length = -0.55 * who.outward(), growth.tip_length * 60.0
+    growth.tip, growth.tip_length = -0.8 * who.outward(), growth.tip_length * 60.0
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.0018, 0.35, 0.25, 0.5
     return styled(who, growth, generator, side)
 
@@ -236,9 +243,9 @@ def mop_top(who: Person, seed: int) -> Strands:
     around = np.arctan2(who.roots[:, 0] - who.middle[0], -(who.roots[:, 1] - who.middle[1]))
     to_back = 0.5 - 0.5 * np.cos(around)
     growth.length = 120.0 + 90.0 * who.height
-    growth.layer = 5.0 + 13.0 * who.height
-    growth.gravity = growth.gravity * 1.1
-    growth.lowest = who.brow + 2.0 - (who.brow - who.nape + 28.0 * who.unit) * np.clip(to_back * 1.25, 0.0, 1.0) ** 0.75
+    growth.layer = 4.0 + 9.0 * who.height
+    growth.gravity, growth.gravity_length = growth.gravity * 1.6, growth.gravity_length * 0.6
+    growth.lowest = who.brow + 8.0 - (who.brow - who.nape + 24.0 * who.unit) * np.clip(to_back * 1.35 - 0.12, 0.0, 1.0) ** 1.3
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.004, 0.4, 0.45, 0.6
     growth.shortest = 28.0
     return styled(who, growth, generator)
@@ -251,10 +258,10 @@ def wavy(who: Person, seed: int) -> Strands:
     growth.comb, side = comb_from_parting(who, 20.0, 0.25, 2.5 * generator.normal(size=len(who.roots)))
     growth.length = 205.0 + 75.0 * who.height
     growth.layer = 4.0 + 16.0 * who.height
-    growth.radius = np.full(len(who.roots), 6.5)
-    growth.wavelength = np.full(len(who.roots), 58.0)
-    growth.flat, growth.ramp, growth.own_phase = 0.6, 70.0, 0.25
-    growth.sway, growth.wisp, growth.lock = 0.005, 0.6, 0.6
+    growth.radius = np.full(len(who.roots), 7.5)
+    growth.wavelength = np.full(len(who.roots), 66.0)
+    growth.flat, growth.ramp, growth.own_phase, growth.phases = 0.5, 70.0, 0.2, "head"
+    growth.sway, growth.wisp, growth.lock = 0.004, 0.6, 0.65
     return styled(who, growth, generator, side)
 
 
@@ -268,8 +275,9 @@ def curly(who: Person, seed: int) -> Strands:
     growth.gravity = growth.gravity * 0.75
     growth.radius = generator.uniform(5.0, 7.5, len(who.roots))
     growth.wavelength = np.full(len(who.roots), 25.0)
-    growth.flat, growth.ramp, growth.own_phase = 1.0, 28.0, 0.35
-    growth.sway, growth.stray, growth.wisp, growth.lock, growth.points = 0.008, 0.5, 0.75, 0.6, 160
+    growth.flat, growth.ramp, growth.own_phase, growth.phases = 1.0, 28.0, 0.16, "lock"
+    growth.sway, growth.stray, growth.wisp, growth.lock, growth.points = 0.008, 0.4, 0.35, 0.92, 160
+    growth.lock_power = 0.4
     return styled(who, growth, generator, side)
 
 
@@ -278,16 +286,19 @@ def jewfro(who: Person, seed: int) -> Strands:
     generator = _random(who, seed)
     growth = straight(who)
     away = unit_rows(who.roots - who.middle + [0.0, 0.0, 8.0 * who.unit])
+    # a ball, not a peak over the forehead
+    away = unit_rows(away + np.array([0.0, 0.35, 0.55]) * np.clip(2.0 * who.forward - 1.0, 0.0, 1.0)[:, None])
     growth.start = unit_rows(who.normals + away)
     growth.comb = unit_rows(away + 0.35 * who.normals + [0.0, 0.0, 0.05])
     growth.comb_length = growth.comb_length * 2.0
     growth.gravity = growth.gravity * 0.12
-    growth.length = 42.0 + 16.0 * who.height
+    growth.length = 52.0 + 14.0 * who.height - 8.0 * who.forward
     growth.layer = 0.0 * growth.layer + 1.0
     growth.radius = generator.uniform(4.0, 5.5, len(who.roots))
     growth.wavelength = np.full(len(who.roots), 12.0)
-    growth.flat, growth.ramp, growth.own_phase = 1.0, 10.0, 0.5
-    growth.sway, growth.sway_length, growth.stray, growth.wisp, growth.lock = 0.02, 45.0, 0.8, 0.5, 0.75
+    growth.flat, growth.ramp, growth.own_phase, growth.phases = 1.0, 10.0, 0.25, "lock"
+    growth.sway, growth.sway_length, growth.stray, growth.wisp, growth.lock = 0.02, 45.0, 0.6, 0.3, 0.88
+    growth.lock_power = 0.5
     growth.points = 128
     return styled(who, growth, generator)
 
@@ -297,14 +308,15 @@ def jheri_curl(who: Person, seed: int) -> Strands:
     generator = _random(who, seed)
     growth = straight(who)
     growth.comb = comb_from_crown(who, 0.1)
-    growth.length = 62.0 + 48.0 * who.height
-    growth.layer = 4.0 + 16.0 * who.height
-    growth.gravity = growth.gravity * 0.8
+    growth.length = 72.0 + 48.0 * who.height
+    growth.layer = 4.0 + 9.0 * who.height
+    growth.gravity, growth.gravity_length = growth.gravity * 1.3, growth.gravity_length * 0.6
     growth.radius = generator.uniform(4.0, 5.5, len(who.roots))
     growth.wavelength = np.full(len(who.roots), 19.0)
-    growth.flat, growth.ramp, growth.own_phase = 1.0, 18.0, 0.25
+    growth.flat, growth.ramp, growth.own_phase, growth.phases = 1.0, 18.0, 0.12, "lock"
     growth.lowest = np.where(who.forward > 0.75, who.brow - 6.0 * who.unit, -1e9)
-    growth.sway, growth.stray, growth.wisp, growth.lock, growth.points = 0.008, 0.4, 0.8, 0.7, 140
+    growth.sway, growth.stray, growth.wisp, growth.lock, growth.points = 0.008, 0.35, 0.3, 0.94, 140
+    growth.lock_power = 0.35
     growth.shortest = 35.0
     return styled(who, growth, generator)
 
@@ -320,13 +332,13 @@ def blowout(who: Person, seed: int) -> Strands:
     growth.start = unit_rows(who.normals * 1.4 + [0.0, 0.0, 0.4])
     growth.comb_length = growth.comb_length * 1.4
     growth.length = 175.0 + 50.0 * who.height
-    growth.layer = 10.0 + 26.0 * who.height
-    growth.gravity = growth.gravity * 0.8
-    growth.radius = np.full(len(parted), 7.0)
-    growth.wavelength = np.full(len(parted), 105.0)
-    growth.flat, growth.ramp, growth.own_phase = 0.7, 70.0, 0.2
-    growth.tip, growth.tip_length = 0.7 * who.outward() + [0.0, 0.25, 0.1], growth.tip_length * 50.0
-    growth.sway, growth.wisp, growth.lock = 0.004, 0.5, 0.55
+    growth.layer = 9.0 + 20.0 * who.height
+    growth.gravity = growth.gravity * 0.9
+    growth.radius = np.full(len(parted), 9.0)
+    growth.wavelength = np.full(len(parted), 125.0)
+    growth.flat, growth.ramp, growth.own_phase, growth.phases = 0.4, 80.0, 0.15, "head"
+    growth.tip, growth.tip_length = 0.3 * who.outward() + [0.0, 0.1, 0.05], growth.tip_length * 45.0
+    growth.sway, growth.stray, growth.wisp, growth.lock = 0.003, 0.3, 0.5, 0.6
     return styled(who, growth, generator, side)
 
 
@@ -341,10 +353,10 @@ def wings(who: Person, seed: int) -> Strands:
     growth.length = 110.0 + 60.0 * who.height - 20.0 * who.forward
     growth.layer = 7.0 + 17.0 * who.height
     outward = who.outward()
-    growth.tip = unit_rows(outward + [0.0, 0.5, 0.55]) * 1.3
+    growth.tip = unit_rows(outward + [0.0, 0.5, 0.45]) * (0.45 + 0.5 * who.forward)[:, None]
     growth.tip_length = growth.tip_length * (45.0 + 15.0 * who.forward)
-    growth.gravity = growth.gravity * 0.85
-    growth.sway, growth.wisp, growth.lock = 0.004, 0.6, 0.6
+    growth.gravity = growth.gravity * 1.1
+    growth.sway, growth.stray, growth.wisp, growth.lock = 0.003, 0.3, 0.5, 0.55
     return styled(who, growth, generator, side)
 
 

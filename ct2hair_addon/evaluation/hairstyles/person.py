@@ -1,8 +1,9 @@
-"""Who wears the hair: the roots on a scalp, its landmarks, its distance field with shoulders, and the wisps of the roots."""
+"""Who wears the hair: the roots on a scalp, its landmarks, its distance field, and the wisps of the roots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,10 +19,7 @@ ROOM = 60.0
 """How far (mm) the distance field reaches beyond the head; farther off, its outer cells go on."""
 
 LONGEST = 340.0
-"""The field reaches this far (mm) below the top of the scalp, shoulders included."""
-
-SHOULDERS = (-0.62, 0.62, 0.78)
-"""Half width and radius of the shoulders, and their depth under the scalp's lowest point, in heights of the scalp."""
+"""The field reaches this far (mm) below the top of the scalp."""
 
 
 @dataclass(frozen=True)
@@ -84,24 +82,45 @@ def unit_rows(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
+@dataclass(frozen=True, eq=False)
+class _Identity:
+    """A head that equals itself alone: its arrays can be neither compared nor hashed as a whole."""
+
+    mesh: HeadMesh
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self.mesh is other.mesh
+
+    def __hash__(self) -> int:
+        return id(self.mesh)
+
+
+@lru_cache(maxsize=1)
+def _measured(of: _Identity) -> tuple[Head, DistanceField, float]:
+    """A head, its distance field and its unit: kept, as one style after another is asked for on the same head."""
+    head = Head(of.mesh)
+    scalp = head.mesh.vertices[head.mesh.scalp].astype(np.float64)
+    low, high = scalp.min(axis=0), scalp.max(axis=0)
+    unit = 0.5 * float(high[0] - low[0]) / 76.0
+    lowest = np.minimum(low - ROOM, [low[0] - ROOM, low[1] - ROOM, high[2] - LONGEST * unit])
+    return head, DistanceField.around(head, lowest, high + ROOM, FIELD_STEP * unit), unit
+
+
 def person(mesh: HeadMesh, strands: int, seed: int) -> Person:
     """Roots spread over a head's scalp (head frame), with everything that styles ask about it."""
-    head = Head(mesh)
+    head, field, unit = _measured(_Identity(mesh))
     on = head.sample_scalp(strands, seed)
     scalp = head.mesh.vertices[head.mesh.scalp].astype(np.float64)
     low, high = scalp.min(axis=0), scalp.max(axis=0)
     middle = 0.5 * (low + high)
-    unit = 0.5 * (high[0] - low[0]) / 76.0
     central = np.abs(scalp[:, 0] - middle[0]) < 8.0 * unit
     at_front = central & (scalp[:, 1] < middle[1])
     hairline = scalp[at_front, 2].min() if at_front.any() else low[2] + 0.8 * (high[2] - low[2])
-    lowest = np.minimum(low - ROOM, [low[0] - ROOM, low[1] - ROOM, high[2] - LONGEST * unit])
-    field = DistanceField.around(head, lowest, high + ROOM, FIELD_STEP * unit)
     return Person(
         on.position.astype(np.float64),
         on.normal.astype(np.float64),
         on.uv,
-        _with_shoulders(field, middle, low[2], unit),
+        field,
         float(unit),
         middle,
         float(0.5 * (high[0] - low[0])),
@@ -111,18 +130,6 @@ def person(mesh: HeadMesh, strands: int, seed: int) -> Person:
         float(high[1]),
         float(hairline),
     )
-
-
-def _with_shoulders(field: DistanceField, middle: np.ndarray, nape: float, unit: float) -> DistanceField:
-    """The field with shoulders below the neck, so that long hair has something to fall on."""
-    axes = [field.origin[a] + field.step * np.arange(field.values.shape[a]) for a in range(3)]
-    x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
-    # a level capsule, drooping outwards
-    across = np.abs(x - middle[0])
-    drop = nape - 160.0 * unit - 0.25 * np.maximum(across - 50.0 * unit, 0.0)
-    beyond = np.maximum(across - 150.0 * unit, 0.0)
-    away = np.sqrt(beyond**2 + (0.9 * (y - middle[1] - 10.0 * unit)) ** 2 + (z - drop) ** 2) - 50.0 * unit
-    return DistanceField(np.minimum(field.values, away.astype(np.float32)), field.step, field.origin)
 
 
 @dataclass(frozen=True)
