@@ -6,13 +6,14 @@ The paper's ablation 4.1.2 in figures (Euclidean against the learned prior), wit
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterable
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .evaluation import hairstyle
-from .head import Head, HeadMesh, template_head
+from .head import Head, template_head
 from .interpolation import Blending, EuclideanCoder, LinearCoder, NetworkCoder
 from .settings import InterpolationSettings
 from .strands import Strands
@@ -36,9 +37,8 @@ def study(
     the truth's), `spectrum` (largest departure of the curvature's power over the bands from the truth's, as a share),
     `length` (ratio).
     """
-    mesh = template_head()
-    truth, kept = _split(style, mesh, strands, held_back, seed)
-    head = Head(mesh)
+    truth, head = _grown(style, strands, seed)
+    kept = np.random.default_rng(seed).random(len(truth)) >= held_back
     roots = head.closest_scalp(truth.roots)
     frames = head.frames(roots.face, roots.bary).astype(np.float64)
     real = truth.resampled(POINTS).astype(np.float64)
@@ -82,9 +82,10 @@ def settings_for(similarity: float | None, phase: str | None) -> InterpolationSe
     return dataclasses.replace(InterpolationSettings(), **changes)
 
 
-def _split(style: str, mesh: HeadMesh, strands: int, held_back: float, seed: int) -> tuple[Strands, np.ndarray]:
-    truth = hairstyle(style, mesh, strands, seed)
-    return truth, np.random.default_rng(seed).random(len(truth)) >= held_back
+@functools.lru_cache(maxsize=1)
+def _grown(style: str, strands: int, seed: int) -> tuple[Strands, Head]:
+    mesh = template_head()
+    return hairstyle(style, mesh, strands, seed), Head(mesh)
 
 
 def _in_frames(strands: Strands, frames: np.ndarray, points: int) -> np.ndarray:

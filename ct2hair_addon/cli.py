@@ -276,7 +276,7 @@ def _add_train_prior(commands) -> None:
     parser.add_argument("--folder", type=Path, help="keeps the strands and the training's state; the same call goes on there")
     parser.add_argument("--measure", type=Path, metavar="WEIGHTS", help="only measure these weights on held-out strands")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw held-out strands and their decodings")
-    parser.add_argument("--steps", type=int, default=600, metavar="N", help="steps of the optimiser")
+    parser.add_argument("--steps", type=int, default=600, metavar="N", help="steps of the optimiser; 0 keeps the linear start")
     parser.add_argument("--batch", type=int, default=256, metavar="N", help="strands a step")
     parser.add_argument("--rate", type=float, default=5e-5, metavar="R", help="Adam's rate for the deeper layers")
     parser.add_argument("--styles", type=int, default=30_000, metavar="N", help="strands of the hairstyles")
@@ -293,8 +293,8 @@ def _train_prior(chosen: argparse.Namespace) -> int:
     if weights is None:
         if chosen.out is None or chosen.folder is None:
             raise CT2HairError("train-prior needs --out and --folder, or --measure with weights that are there")
-        if min(chosen.steps, chosen.batch) < 1 or chosen.rate <= 0.0 or min(chosen.styles, chosen.single) < 0:
-            raise CT2HairError("--steps and --batch are at least 1, --rate is above 0, --styles and --single are not negative")
+        if chosen.batch < 1 or chosen.rate <= 0.0 or min(chosen.steps, chosen.styles, chosen.single) < 0:
+            raise CT2HairError("--batch is at least 1, --rate is above 0, --steps, --styles and --single are not negative")
         weights = chosen.out
         plan = TrainingPlan(chosen.steps, chosen.batch, chosen.rate, seed=chosen.seed)
         recipe = training.Recipe(chosen.styles, chosen.single, chosen.seed)

@@ -105,7 +105,7 @@ class InterpolationSettings:
         high=1.0,
     )
     coder: str = parameter(
-        "linear",
+        "network",
         "what guides are blended as: codes of the learned prior, cosines of their directions, or plain positions",
         choices=("network", "linear", "euclidean"),
     )
@@ -266,7 +266,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "interpolation.farthest": 6.0,
         "interpolation.texture": 2048,
         "interpolation.similarity": 0.0,
-        "interpolation.coder": "network",
         "interpolation.phase": "found",
         "refinement.method": "chamfer",
         "refinement.iterations": 80,

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from ct2hair_addon import training
 from ct2hair_addon.errors import CT2HairError
-from ct2hair_addon.interpolation import LinearCoder, NetworkCoder, blend, chosen_coder, prior
+from ct2hair_addon.interpolation import EuclideanCoder, LinearCoder, NetworkCoder, blend, chosen_coder, prior
 from ct2hair_addon.interpolation.network import CODE, LEARNED, STEPS, StrandPrior, cosines
 from ct2hair_addon.interpolation.procedural import KINDS, LONGEST, MOST_TURN, SHORTEST, procedural_strands
 from ct2hair_addon.interpolation.train import TrainingPlan, start_linear, steps_of, train
@@ -50,7 +50,7 @@ class TestShippedWeights:
         facts = read_facts(prior.WEIGHTS)
         assert {"recipe", "plan", "torch", "held_out"} <= facts.keys()
         assert facts["recipe"]["seed"] == facts["plan"]["seed"] == 0
-        assert facts["plan"]["steps"] >= 1000 and facts["recipe"]["styles"] >= 10_000
+        assert facts["plan"]["steps"] >= 500 and facts["recipe"]["styles"] >= 10_000
         assert facts["held_out"]["all"]["within"] >= 0.99
         assert prior.WEIGHTS.stat().st_size < 5e6
 
@@ -116,21 +116,23 @@ class TestProceduralStrands:
         moves /= size[:, :, None]
         turn = np.degrees(np.arccos(np.clip((moves[:, 1:] * moves[:, :-1]).sum(axis=2), -1.0, 1.0)))
         assert turn.max() < MOST_TURN + 0.1
-        turns = turn.sum(axis=1) / 360.0
+        turns = training.turns(fresh.shapes)
+        np.testing.assert_allclose(turns, turn.sum(axis=1) / 360.0, atol=1e-2)
         assert np.median(turns[fresh.kind == KINDS.index("rod")]) < 1.0
-        assert np.median(turns[fresh.kind == KINDS.index("coil")]) > 4.0
+        assert np.percentile(turns[fresh.kind == KINDS.index("coil")], 90) > 8.0
         np.testing.assert_array_equal(fresh.shapes[:, 0], 0.0)
 
-    def test_waves_lie_nearly_in_a_plane_and_helices_do_not(self):
+    def test_waves_swing_nearly_in_a_plane_and_coils_do_not(self):
         made = procedural_strands(600, 9)
+        often = training.turns(made.shapes) > 5.0
 
         def flatness(kind: str) -> float:
-            steps = np.diff(made.shapes[made.kind == KINDS.index(kind)], axis=1)
+            steps = np.diff(made.shapes[often & (made.kind == KINDS.index(kind))], axis=1)
             steps = steps - steps.mean(axis=1, keepdims=True)
             spread = np.linalg.svd(steps, compute_uv=False) ** 2
-            return float(np.median(spread[:, 2] / spread.sum(axis=1)))
+            return float(np.median(spread[:, 1] / spread.sum(axis=1)))
 
-        assert flatness("wave") < 0.5 * flatness("coil")
+        assert flatness("wave") < 0.1 < 0.3 < flatness("coil")
 
 
 class TestTraining:
@@ -238,17 +240,17 @@ class TestWeightsThatWontDo:
 
     def test_only_the_setting_lets_the_linear_coder_step_in(self, tmp_path, monkeypatch):
         monkeypatch.setattr(prior, "WEIGHTS", tmp_path / "absent.safetensors")
-        network = Settings().changed({"interpolation.coder": "network"}).interpolation
         with pytest.raises(CT2HairError, match="missing"):
-            chosen_coder(network)
+            chosen_coder(InterpolationSettings())
         tally: dict[str, int] = {}
-        lenient = Settings().changed({"interpolation.coder": "network", "interpolation.without_prior": "linear"})
+        lenient = Settings().changed({"interpolation.without_prior": "linear"})
         assert isinstance(chosen_coder(lenient.interpolation, tally), LinearCoder)
         assert sum(tally.values()) == 1
 
-    def test_the_default_needs_no_weights(self, tmp_path, monkeypatch):
+    @pytest.mark.parametrize(("name", "kind"), [("linear", LinearCoder), ("euclidean", EuclideanCoder)])
+    def test_the_other_coders_need_no_weights(self, tmp_path, monkeypatch, name, kind):
         monkeypatch.setattr(prior, "WEIGHTS", tmp_path / "absent.safetensors")
-        assert chosen_coder(InterpolationSettings()).points > 2
+        assert isinstance(chosen_coder(Settings().changed({"interpolation.coder": name}).interpolation), kind)
 
 
 def test_the_learned_part_is_the_larger_part_of_a_code():
