@@ -22,11 +22,12 @@ class Coder(Protocol):
     bitangent, normal), the root at 0. Codes: (N, C) float32, such that weighted sums of near codes are strands, too.
 
     points: how many points the shapes have that `decode` gives. in_phase: whether the curls of strands are to be brought
-    into phase (`phase.py`) before they are blended.
+    into phase (`phase.py`) before they are blended. lossy: whether there are strands that a code doesn't hold.
     """
 
     points: int
     in_phase: bool
+    lossy: bool
 
     def encode(self, shapes: np.ndarray) -> np.ndarray: ...
 
@@ -37,6 +38,7 @@ class EuclideanCoder:
     """The plain blend that the paper compares its prior with (4.1.2): a code is the shape's coordinates."""
 
     in_phase = False
+    lossy = False
 
     def __init__(self, points: int = SHAPE_POINTS) -> None:
         self.points = points
@@ -56,6 +58,7 @@ class LinearCoder:
     """
 
     in_phase = True
+    lossy = False
 
     def __init__(self, points: int = SHAPE_POINTS) -> None:
         self.points = points

@@ -13,7 +13,7 @@ from ..settings import InterpolationSettings
 from ..strands import Strands, concatenate
 from ..volume import BrickVolume
 from ..volume.strand_signal import outward, support_along
-from .coder import SHAPE_POINTS, Coder, blend, chosen_coder
+from .coder import SHAPE_POINTS, Coder, LinearCoder, blend, chosen_coder
 from .phase import LEAST_SWING, in_phase, swing_share
 
 ANGLE_POINTS = 25
@@ -30,6 +30,8 @@ CANDIDATES = 4
 CLEARANCE = 0.1
 """Distance from the head, mm, that points of new strands are brought to."""
 PUSHES = 6
+LOST_ANGLE = 12.0
+"""Mean angle, degrees, between a guide and its decoding, from which on its curls are lost: errors of tracing make 3 to 8."""
 RELAX = 0.9
 """By how much the distance between new roots gives way from one round to the next."""
 CHUNK = 2000
@@ -89,6 +91,8 @@ def fill_scalp(
     frames = head.frames(rooted.face, rooted.bary).astype(np.float64)
     shapes = np.einsum("nij,npj->npi", frames, guides.resampled(coder.points) - guides.roots[:, None]).astype(np.float32)
     blending = Blending(shapes, uv, coder, settings)
+    if not blending.held.all():
+        tally["guides that the learned prior does not hold: blended by cosines"] = int(np.count_nonzero(~blending.held))
     new = np.empty((len(places.uv), SHAPE_POINTS, 3), np.float32)
     alone = 0
     for start in range(0, len(new), CHUNK):
@@ -126,6 +130,20 @@ class Blending:
         self._aligned = coder.in_phase and settings.phase == "aligned"
         self._swing = swing_share(shapes) if self._aligned else None
         self._tree = cKDTree(uv)
+        # What a lossy code doesn't hold (more turns than it knows) is blended by cosines, lest it be flattened.
+        self.held = self._held() if coder.lossy else np.ones(len(shapes), bool)
+        self._instead = None if self.held.all() else Blending(shapes, uv, LinearCoder(coder.points), settings)
+
+    def _held(self) -> np.ndarray:
+        """(N,) bool: guides whose code gives back their directions, to LOST_ANGLE in the mean."""
+        held = np.empty(len(self._shapes), bool)
+        for start in range(0, len(held), CHUNK):
+            rows = slice(start, start + CHUNK)
+            a, b = (np.diff(shapes, axis=1) for shapes in (self._shapes[rows], self._coder.decode(self._codes[rows])))
+            size = np.linalg.norm(a, axis=2) * np.linalg.norm(b, axis=2)
+            cosine = np.clip((a * b).sum(axis=2) / np.maximum(size, 1e-12), -1.0, 1.0)
+            held[rows] = np.degrees(np.arccos(cosine)).mean(axis=1) < LOST_ANGLE
+        return held
 
     def at(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(M, P, 3) float32 mm, strands in the frames of the places `uv` (M, 2), and the weights (M, k) of the guides."""
@@ -140,7 +158,11 @@ class Blending:
             if len(rows):
                 aligned = in_phase(self._shapes[near[rows]], weights[rows])
                 codes[rows] = self._coder.encode(aligned.reshape(-1, *aligned.shape[2:])).reshape(len(rows), neighbours, -1)
-        return self._coder.decode(blend(codes, weights)), weights
+        made = self._coder.decode(blend(codes, weights))
+        lost = np.flatnonzero((~self.held[near] & (weights > 0.0)).any(axis=1))
+        if len(lost):
+            made[lost] = self._instead.at(uv[lost])[0]
+        return made, weights
 
 
 def blend_weights(

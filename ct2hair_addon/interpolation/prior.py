@@ -30,6 +30,7 @@ class NetworkCoder:
     """
 
     in_phase = True
+    lossy = True
 
     def __init__(self, prior, points: int = NETWORK_POINTS) -> None:
         self._prior = prior

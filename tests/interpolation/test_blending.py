@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from ct2hair_addon import blending_study
 from ct2hair_addon.errors import CT2HairError
-from ct2hair_addon.interpolation import Blending, EuclideanCoder, LinearCoder
+from ct2hair_addon.interpolation import Blending, EuclideanCoder, LinearCoder, NetworkCoder
 from ct2hair_addon.interpolation.phase import in_phase, swing_share
 from ct2hair_addon.interpolation.procedural import procedural_strands
 from ct2hair_addon.settings import Settings
@@ -102,6 +103,23 @@ class TestBlending:
         ]
         assert radii[0] < 4.5 and radii[1] > 5.3
 
+    def test_coils_beyond_the_learned_prior_are_kept_by_cosines(self):
+        coils = np.stack([curl(p, radius=2.0, turns=30.0, points=256) for p in (0.0, 0.3, 0.6, 0.9)])
+        network = NetworkCoder.load()
+        assert mean_radius(network.decode(network.encode(coils[:1]))[0], 30.0) < 1.0
+        blending = Blending(coils, self.UV, network, Settings().interpolation)
+        made, _ = blending.at(np.array([[0.3, 0.2], [1e-6, 1e-6]]))
+        assert not blending.held.any()
+        assert mean_radius(made[1], 30.0) == pytest.approx(mean_radius(coils[0], 30.0), rel=0.05)
+        assert mean_radius(made[0], 30.0) > 0.8 * mean_radius(coils[0], 30.0)
+
+    def test_noisy_guides_are_held_by_the_learned_prior(self):
+        generator = np.random.default_rng(4)
+        smooth = np.stack([curl(p, points=256) for p in (0.0, 0.3, 0.6, 0.9)])
+        noise = np.repeat(generator.normal(0.0, 0.15, (4, 64, 3)), 4, axis=1)
+        noisy = (smooth + gaussian_filter1d(noise, 3.0, axis=1)).astype(np.float32)
+        assert Blending(noisy, self.UV, NetworkCoder.load(), Settings().interpolation).held.all()
+
     def test_phase_found_blends_as_the_paper_does(self):
         shapes = np.stack([curl(p) for p in (0.0, 1.8, -1.8, 2.5)])
         settings = Settings().changed({"interpolation.similarity": 0.0, "interpolation.phase": "found"}).interpolation
@@ -112,7 +130,7 @@ class TestBlending:
 @pytest.mark.slow
 def test_held_back_curls_keep_their_curvature_and_length_in_the_learned_blend():
     settings = blending_study.settings_for(0.0, None)
-    scores = blending_study.study("curly", settings, strands=1200, held_back=0.3)
+    scores = blending_study.study("curly", settings, strands=2000)
     euclidean, network, linear = scores["euclidean"], scores["network"], scores["linear"]
     for learned in (network, linear):
         assert abs(learned["length"] - 1.0) < 0.06 < abs(euclidean["length"] - 1.0)
