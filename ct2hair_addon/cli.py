@@ -1,4 +1,4 @@
-"""The command line: synthesize | reconstruct | evaluate | benchmark | convert.
+"""The command line: synthesize | reconstruct | evaluate | benchmark | convert | train-prior | study-blending.
 
 The options of `reconstruct` are made from `settings.py`.
 
@@ -60,7 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ct2hair", description="Hair strands from a CT scan of a wig.")
     parser.add_argument("--version", action="version", version=f"ct2hair {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (_add_synthesize, _add_reconstruct, _add_evaluate, _add_benchmark, _add_convert):
+    for add in (
+        _add_synthesize, _add_reconstruct, _add_evaluate, _add_benchmark, _add_convert, _add_train_prior, _add_study_blending,
+    ):  # fmt: skip
         add(commands)
     return parser
 
@@ -301,4 +303,73 @@ def _convert(chosen: argparse.Namespace) -> int:
         strands = strands.with_points(strands.points * np.float32(chosen.scale))
     write_strands(strands, chosen.target)
     print(f"{len(strands)} strands, {len(strands.points)} points: {chosen.target}")
+    return DONE
+
+
+def _add_train_prior(commands) -> None:
+    parser = _add_command(commands, "train-prior", _train_prior, "train the strand prior's network, or measure its weights")
+    parser.add_argument("--out", type=Path, metavar="WEIGHTS", help="where the weights go (.safetensors)")
+    parser.add_argument("--folder", type=Path, help="keeps the strands and the training's state; the same call goes on there")
+    parser.add_argument("--measure", type=Path, metavar="WEIGHTS", help="only measure these weights on held-out strands")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw held-out strands and their decodings")
+    parser.add_argument("--steps", type=int, default=600, metavar="N", help="steps of the optimiser; 0 keeps the linear start")
+    parser.add_argument("--batch", type=int, default=256, metavar="N", help="strands a step")
+    parser.add_argument("--rate", type=float, default=5e-5, metavar="R", help="Adam's rate for the deeper layers")
+    parser.add_argument("--styles", type=int, default=30_000, metavar="N", help="strands of the hairstyles")
+    parser.add_argument("--single", type=int, default=30_000, metavar="N", help="procedural single strands")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the strands and of the training")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads of torch; 0 takes all")
+
+
+def _train_prior(chosen: argparse.Namespace) -> int:
+    from . import training
+    from .interpolation.train import TrainingPlan
+
+    weights = chosen.measure
+    if weights is None:
+        if chosen.out is None or chosen.folder is None:
+            raise CT2HairError("train-prior needs --out and --folder, or --measure with weights that are there")
+        if chosen.batch < 1 or chosen.rate <= 0.0 or min(chosen.steps, chosen.styles, chosen.single) < 0:
+            raise CT2HairError("--batch is at least 1, --rate is above 0, --steps, --styles and --single are not negative")
+        weights = chosen.out
+        plan = TrainingPlan(chosen.steps, chosen.batch, chosen.rate, seed=chosen.seed)
+        recipe = training.Recipe(chosen.styles, chosen.single, chosen.seed)
+        figures = training.train_prior(
+            chosen.out, chosen.folder, recipe, plan, chosen.threads, lambda text: print(f"ct2hair: {text}", file=sys.stderr)
+        )
+    else:
+        figures = training.held_out_figures(weights, chosen.seed)
+    print(training.as_table(figures))
+    if chosen.picture:
+        training.draw_decodings(weights, chosen.picture, chosen.seed)
+    return DONE
+
+
+def _add_study_blending(commands) -> None:
+    parser = _add_command(
+        commands, "study-blending", _study_blending, "hold back strands of hairstyles and blend them by each coder"
+    )
+    parser.add_argument("styles", nargs="*", metavar="STYLE", help="names of hairstyles; none takes all")
+    parser.add_argument("--strands", type=int, default=3000, metavar="N", help="strands of each hairstyle")
+    parser.add_argument("--held-back", type=float, default=0.5, metavar="SHARE", help="share of them that is blended anew")
+    parser.add_argument("--noise", type=float, default=0.0, metavar="MM", help="error put on the strands that are kept")
+    parser.add_argument("--similarity", type=float, metavar="S", help="in place of interpolation.similarity")
+    parser.add_argument("--phase", choices=("aligned", "found"), help="in place of interpolation.phase")
+    parser.add_argument("--seed", type=int, default=31, metavar="N", help="seed of the hairstyles")
+
+
+def _study_blending(chosen: argparse.Namespace) -> int:
+    from . import blending_study
+    from .evaluation import STYLES
+
+    settings = blending_study.settings_for(chosen.similarity, chosen.phase)
+    table = blending_study.as_table(
+        chosen.styles or STYLES,
+        settings,
+        strands=chosen.strands,
+        held_back=chosen.held_back,
+        seed=chosen.seed,
+        noise=chosen.noise,
+    )
+    print(table)
     return DONE

@@ -125,6 +125,21 @@ class InterpolationSettings:
         low=0.0,
         high=1.0,
     )
+    coder: str = parameter(
+        "network",
+        "what guides are blended as: codes of the learned prior, cosines of their directions, or plain positions",
+        choices=("network", "linear", "euclidean"),
+    )
+    phase: str = parameter(
+        "aligned",
+        "network and linear: curls are brought into phase before they are blended, or blended as they are found",
+        choices=("aligned", "found"),
+    )
+    without_prior: str = parameter(
+        "refuse",
+        "where the learned prior can't be loaded: refuse the job, or go on with the linear coder",
+        choices=("refuse", "linear"),
+    )
 
 
 @dataclass(frozen=True)
@@ -277,6 +292,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "interpolation.farthest": 6.0,
         "interpolation.texture": 2048,
         "interpolation.similarity": 0.0,
+        "interpolation.phase": "found",
         "refinement.method": "chamfer",
         "refinement.iterations": 80,
         "refinement.points": 64,

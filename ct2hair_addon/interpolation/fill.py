@@ -13,11 +13,10 @@ from ..settings import InterpolationSettings
 from ..strands import Strands, concatenate
 from ..volume import BrickVolume
 from ..volume.strand_signal import outward, support_along
-from .coder import Coder, EuclideanCoder, blend
+from .coder import SHAPE_POINTS, Coder, LinearCoder, blend, chosen_coder
+from .phase import LEAST_SWING, in_phase, swing_share
 from .texture import SIDE, drawn_texels, eq3_weights, texels_of
 
-SHAPE_POINTS = 100
-"""Points of a shape on its way through the coder: 3 mm apart on long hair, so that curls of a few mm come through."""
 ANGLE_POINTS = 25
 """Points at which the directions of two strands are compared."""
 ROOT_REACH = 0.5
@@ -32,6 +31,8 @@ CANDIDATES = 4
 CLEARANCE = 0.1
 """Distance from the head, mm, that points of new strands are brought to."""
 PUSHES = 6
+LOST_ANGLE = 12.0
+"""Mean angle, degrees, between a guide and its decoding, from which on its curls are lost: errors of tracing make 3 to 8."""
 RELAX = 0.9
 """By how much the distance between new roots gives way from one round to the next."""
 CHUNK = 2000
@@ -65,20 +66,21 @@ def fill_scalp(
     guides: mm, scan frame, root first, the root on the scalp. head: `ct2hair_addon.head.Head` (or its like) in the same frame.
     count: strands of the result, exactly (the best-backed guides stay where there are more); 0 keeps every
     guide and fills what the settings' distances allow. density, hair_level: give new strands their `support`;
-    without them it is 0. coder: how strands are blended (`EuclideanCoder`). The same seed gives the same bits.
+    without them it is 0. coder: how strands are blended, in place of `settings.coder`. The same seed gives the same bits.
 
     New roots are blue noise on the scalp, not closer to a guide's root than `settings.nearest` nor farther than
     `settings.farthest` texels (the latter gives way, and is counted, where `count` could not be reached). With
     `settings.method` "texture" they are the paper's (`texture`): `count` texels are drawn (0: 100,000), those outside the two
     distances discarded, and the new strands left as the coder gives them, inside the head or not.
     """
-    settings, coder = settings or InterpolationSettings(), coder or EuclideanCoder()
+    settings = settings or InterpolationSettings()
     progress(0.0, 1.0)
     if not len(guides):
         empty = Strands(np.zeros((0, 3), np.float32), np.zeros(1, np.int64))
         return Dense(_attributed(empty, np.zeros((0, 2)), np.zeros(0), 0), {"guides": 0, "new strands": 0})
     drawn = settings.method == "texture"
     guides, tally = _thinned(guides, 0 if drawn else count)
+    coder = coder or chosen_coder(settings, tally)
     rooted = head.closest_scalp(guides.roots)
     uv = np.asarray(guides.strand_attributes.get("root_uv", rooted.uv), np.float32)
     uv = np.where(np.isfinite(uv).all(axis=1, keepdims=True), uv, rooted.uv)
@@ -95,28 +97,20 @@ def fill_scalp(
     progress(0.2, 1.0)
 
     frames = head.frames(rooted.face, rooted.bary).astype(np.float64)
-    shapes = np.einsum("nij,npj->npi", frames, guides.resampled(SHAPE_POINTS) - guides.roots[:, None]).astype(np.float32)
-    codes = coder.encode(shapes)
-    directions, lengths = _directions(shapes), guides.lengths()
-    neighbours = min(settings.neighbours, len(guides))
-    texels = (uv, places.uv)
-    if drawn:
-        texels = tuple(texels_of(some, settings.texture or SIDE) for some in texels)
-    distance, near = cKDTree(texels[0]).query(texels[1], k=neighbours)
-    distance, near = distance.reshape(len(places.uv), -1), near.reshape(len(places.uv), -1)
+    shapes = np.einsum("nij,npj->npi", frames, guides.resampled(coder.points) - guides.roots[:, None]).astype(np.float32)
+    blending = Blending(shapes, uv, coder, settings)
+    if not blending.held.all():
+        tally["guides that the learned prior does not hold: blended by cosines"] = int(np.count_nonzero(~blending.held))
     new = np.empty((len(places.uv), SHAPE_POINTS, 3), np.float32)
     alone = 0
     for start in range(0, len(new), CHUNK):
         progress(0.2 + 0.4 * start / len(new), 1.0)
         rows = slice(start, start + CHUNK)
-        if drawn:
-            weights = eq3_weights(distance[rows], near[rows], codes)
-        else:
-            weights = blend_weights(distance[rows], near[rows], directions, lengths, settings.similarity)
+        made, weights = blending.at(places.uv[rows])
         alone += int(np.count_nonzero((weights > 0.0).sum(axis=1) == 1))
-        made = coder.decode(blend(codes[near[rows]], weights))
         turned = np.einsum("nij,npi->npj", head.frames(places.face[rows], places.bary[rows]), made)
-        new[rows] = turned + places.position[rows][:, None]
+        turned += places.position[rows][:, None]
+        new[rows] = turned if coder.points == SHAPE_POINTS else Strands.from_array(turned).resampled(SHAPE_POINTS)
     tally |= {"new strands": len(new), "copied from one guide: its neighbours part ways": alone}
     if not drawn:
         new, pushed = _outside(new, head, part(progress, 0.6, 0.9))
@@ -129,6 +123,64 @@ def fill_scalp(
     )
     progress(1.0, 1.0)
     return Dense(result, tally)
+
+
+class Blending:
+    """Strands for places on the scalp texture, blended from the guides nearest there (eq. 3).
+
+    shapes: (N, P, 3) mm, the guides in their roots' frames, P the coder's points. uv: (N, 2), their places on the texture.
+    With `settings.method` "texture" distances and weights are the paper's, and every guide is blended by its code.
+    """
+
+    def __init__(self, shapes: np.ndarray, uv: np.ndarray, coder: Coder, settings: InterpolationSettings) -> None:
+        self._shapes, self._coder, self._settings = shapes, coder, settings
+        self._codes = coder.encode(shapes)
+        self._directions = _directions(shapes)
+        self._lengths = np.linalg.norm(np.diff(shapes, axis=1), axis=2).sum(axis=1)
+        self._aligned = coder.in_phase and settings.phase == "aligned"
+        self._swing = swing_share(shapes) if self._aligned else None
+        self._drawn = settings.method == "texture"
+        self._tree = cKDTree(self._places(uv))
+        # What a lossy code doesn't hold (more turns than it knows) is blended by cosines, lest it be flattened.
+        self.held = self._held() if coder.lossy and not self._drawn else np.ones(len(shapes), bool)
+        self._instead = None if self.held.all() else Blending(shapes, uv, LinearCoder(coder.points), settings)
+
+    def _places(self, uv: np.ndarray) -> np.ndarray:
+        """Where distances are taken: on the texture, by the paper's way between whole texels."""
+        return texels_of(uv, self._settings.texture or SIDE) if self._drawn else uv
+
+    def _held(self) -> np.ndarray:
+        """(N,) bool: guides whose code gives back their directions, to LOST_ANGLE in the mean."""
+        held = np.empty(len(self._shapes), bool)
+        for start in range(0, len(held), CHUNK):
+            rows = slice(start, start + CHUNK)
+            a, b = (np.diff(shapes, axis=1) for shapes in (self._shapes[rows], self._coder.decode(self._codes[rows])))
+            size = np.linalg.norm(a, axis=2) * np.linalg.norm(b, axis=2)
+            cosine = np.clip((a * b).sum(axis=2) / np.maximum(size, 1e-12), -1.0, 1.0)
+            held[rows] = np.degrees(np.arccos(cosine)).mean(axis=1) < LOST_ANGLE
+        return held
+
+    def at(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(M, P, 3) float32 mm, strands in the frames of the places `uv` (M, 2), and the weights (M, k) of the guides."""
+        neighbours = min(self._settings.neighbours, len(self._shapes))
+        distance, near = (found.reshape(len(uv), -1) for found in self._tree.query(self._places(uv), k=neighbours))
+        codes = self._codes[near]
+        if self._drawn:
+            weights = eq3_weights(distance, near, self._codes)
+        else:
+            weights = blend_weights(distance, near, self._directions, self._lengths, self._settings.similarity)
+        if self._aligned and neighbours > 1:
+            # Smooth neighbours have no phase, and one alone needs none.
+            swinging = (self._swing[near] > LEAST_SWING).all(axis=1) & ((weights > 0.0).sum(axis=1) > 1)
+            rows = np.flatnonzero(swinging)
+            if len(rows):
+                aligned = in_phase(self._shapes[near[rows]], weights[rows])
+                codes[rows] = self._coder.encode(aligned.reshape(-1, *aligned.shape[2:])).reshape(len(rows), neighbours, -1)
+        made = self._coder.decode(blend(codes, weights))
+        lost = np.flatnonzero((~self.held[near] & (weights > 0.0)).any(axis=1))
+        if len(lost):
+            made[lost] = self._instead.at(uv[lost])[0]
+        return made, weights
 
 
 def blend_weights(

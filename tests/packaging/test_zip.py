@@ -9,6 +9,8 @@ import extension
 import lock
 import pytest
 
+from ct2hair_addon.interpolation import prior
+
 pytestmark = pytest.mark.slow
 
 # every package that the engine may import, and that none of it comes from anywhere but the zip's wheels
@@ -103,10 +105,17 @@ def test_the_zip_alone_reconstructs_a_scan(blender45):
     blender45.run_enabled(RECONSTRUCT, str(scan), str(blender45.folder / "result"))
 
 
+def test_the_strand_prior_s_weights_are_among_what_users_get(tmp_path):
+    extension.stage_extension(tmp_path / "staged", [], [])
+    shipped = Path(prior.WEIGHTS).relative_to(extension.ROOT)
+    assert (tmp_path / "staged" / shipped).read_bytes() == prior.WEIGHTS.read_bytes()
+
+
 def test_the_zip_holds_what_users_need_and_no_more(blender45):
     (archive,) = blender45.folder.glob("ct2hair-*.zip")
     with zipfile.ZipFile(archive) as file:
         names = [Path(name) for name in file.namelist()]
+    assert Path(prior.WEIGHTS).relative_to(extension.ROOT) in names
     top = {name.parts[0] for name in names}
     assert top == {*extension.SHIPPED, "blender_manifest.toml", "wheels"}
     assert not [name for name in names if "__pycache__" in name.parts or name.name.startswith(".")]
