@@ -3,7 +3,7 @@
 `frames` says where things stand; `session` is the scripting API that the operators and the command line share.
 """
 
-from .export import write_alembic, write_blend, write_usd
+from .export import write_alembic, write_blend, write_strand_file, write_usd
 from .frames import MM, head_from_scan, scene_from_scan
 from .hair import NewHair, full_width_factor, new_hair, set_width_factor, strands_of
 from .head import SCALP_GROUP, SCALP_UV, add_scalp_uv, head_mesh, new_head, save_head
@@ -12,16 +12,20 @@ from .picture import render_picture, render_turntable
 from .results import ROLE, HairResult, ScanResult, active_result, result_of, results
 from .session import (
     FORMATS,
+    STRAND_FORMATS,
+    STRAND_UNITS,
     check_job,
     default_folder,
     export_all,
     import_scan,
+    import_strands,
     load_result,
     reconstruct,
     scan_name,
     show_strands,
     start_job,
 )
+from .simulation import SimulationResult, clear_simulation, simulate, simulated_frames
 from .staging import NewData, remove_collection
 from .volume import GridSummary, new_volume, summarize
 
@@ -33,20 +37,25 @@ __all__ = [
     "ROLE",
     "SCALP_GROUP",
     "SCALP_UV",
+    "STRAND_FORMATS",
+    "STRAND_UNITS",
     "GridSummary",
     "HairResult",
     "NewData",
     "NewHair",
     "ScanResult",
+    "SimulationResult",
     "active_result",
     "add_scalp_uv",
     "check_job",
+    "clear_simulation",
     "default_folder",
     "export_all",
     "full_width_factor",
     "head_from_scan",
     "head_mesh",
     "import_scan",
+    "import_strands",
     "load_result",
     "new_hair",
     "new_head",
@@ -64,10 +73,13 @@ __all__ = [
     "set_hair_colour",
     "set_width_factor",
     "show_strands",
+    "simulate",
+    "simulated_frames",
     "start_job",
     "strands_of",
     "summarize",
     "write_alembic",
     "write_blend",
+    "write_strand_file",
     "write_usd",
 ]
