@@ -14,6 +14,8 @@ from typing import Any
 
 from .errors import SettingsError
 
+STOPS = ("scan", "head", "guides", "dense")
+"""Stages of the pipeline that a reconstruction may stop after, to be looked at; without, it goes through."""
 AXES = ("auto", "+x", "-x", "+y", "-y", "+z", "-z")
 
 
@@ -43,6 +45,11 @@ class HeadSettings:
     mesh: str = parameter("", "OBJ file of a head with a group or material 'scalp'; empty takes the built-in mannequin")
     face: str = parameter("auto", "scan axis that the face looks along", choices=AXES)
     up: str = parameter("auto", "scan axis that points to the crown", choices=AXES)
+    place: str = parameter(
+        "",
+        "where the head stands in the scan, by hand: the 16 numbers, by row, of the matrix head to scan; empty finds it",
+        unit="mm",
+    )
     net_clearance: float = parameter(
         1.5, "hair voxels closer to the scalp than this are taken for the hairnet", unit="mm", low=0.0, high=10.0
     )

@@ -238,9 +238,7 @@ class _CurvesWriter:
             self._counts = strands.counts
             self._write_attributes(strands, widths)
         elif not np.array_equal(strands.counts, self._counts):
-            raise CT2HairError(
-                f"'{self._object.name}' has other strands in a later frame; all frames need the same"
-            )
+            raise CT2HairError(f"'{self._object.name}' has other strands in a later frame; all frames need the same")
 
     def _write_attributes(self, strands: Strands, widths: np.ndarray) -> None:
         """The groom attributes and the strands' own, once: they don't move."""

@@ -13,6 +13,7 @@ Every function builds its data first and links it last: where one fails, the sce
 from __future__ import annotations
 
 import json
+import subprocess
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,13 +26,13 @@ from mathutils import Matrix
 from .. import __version__, jobs
 from ..cache import cache_folder
 from ..errors import Cancelled, CT2HairError, ScanError
-from ..head import Head, HeadMesh, load_obj, unwrap
+from ..head import Head, HeadMesh, fit_to_roots, load_obj, template_head, unwrap
 from ..progress import Progress, silent
 from ..settings import Settings
 from ..strand_files import read_strands
 from ..strands import Strands
 from .export import write_alembic, write_blend, write_strand_file, write_usd
-from .frames import MM, head_from_scan, scene_from_scan, scene_from_unregistered_scan
+from .frames import MM, head_from_scan, rigid, scene_from_scan, scene_from_unregistered_scan
 from .hair import DIAMETER, new_hair
 from .head import attach, head_mesh, new_head, save_head
 from .materials import guide_material, hair_material
@@ -218,18 +219,135 @@ def start_job(
     *,
     head: bpy.types.Object | None = None,
     python: str | None = None,
+    environment: Mapping[str, str] | None = None,
+    until: str | None = None,
 ) -> jobs.Job:
     """Start the reconstruction of `scan` into `folder` in a background process that Blender's own modules are known to.
 
     head: a mesh object of the user's, with a vertex group 'scalp', in place of the built-in mannequin. python: another
-    interpreter for the worker. Raises ScanError or HeadError before anything is started.
+    interpreter for the worker. environment: variables for it. until: the stage to stop after (`STOPS`). Raises ScanError or
+    HeadError before anything is started.
     """
     if not Path(scan).exists():
         raise ScanError(f"{scan}: there is no such file; choose the scan again")
     if head is not None:
         settings = settings.changed({"head.mesh": str(save_head(head, Path(folder) / "template.obj").resolve())})
     _expose_bundled_modules()
-    return jobs.start(scan, folder, settings, python=python)
+    return jobs.start(scan, folder, settings, python=python, environment=environment, until=until)
+
+
+def start_inspection(
+    scan: str | Path,
+    folder: str | Path,
+    settings: Settings,
+    *,
+    python: str | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.Popen:
+    """Start looking at `scan` in the background; `folder`/inspection.npz is there when the process ends with 0.
+
+    What it says, an error too, is in `folder`/inspection.txt. Raises ScanError where there is no such scan.
+    """
+    if not Path(scan).exists():
+        raise ScanError(f"{scan}: there is no such file; choose the scan again")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    chosen = folder / "inspection.json"
+    chosen.write_text(json.dumps({"scan": settings.to_dict()["scan"]}))
+    _expose_bundled_modules()
+    arguments = ["inspect", str(Path(scan).resolve()), "--out", str((folder / "inspection.npz").resolve())]
+    arguments += ["--settings", str(chosen.resolve())]
+    return jobs.start_command(arguments, folder / "inspection.txt", python=python, environment=environment)
+
+
+def load_stage(folder: str | Path, *, colour: str = "brown", context: bpy.types.Context | None = None) -> bpy.types.Collection:
+    """Bring what a job has that was stopped after a stage: the wig, the head in it, guides or dense hair; a new collection.
+
+    Raises CT2HairError where there is nothing; the scene is then untouched.
+    """
+    folder = Path(folder)
+    path = folder / "stage.json"
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+        until, level = known["until"], known["scan"]["hair_level"]
+        name = f"{scan_name(known['scan']['file'])} {until}"
+        matrix = np.array(known["head"]["head_to_scan"], np.float64).reshape(4, 4) if known["head"] else None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CT2HairError(f"{path}: not the state of a job ({error}); run the stage again") from None
+    properties = {
+        "ct2hair_folder": str(folder.resolve()),
+        "ct2hair_report": json.dumps(known),
+        "ct2hair_settings": json.dumps(known["settings"], sort_keys=True),
+        "ct2hair_version": known["program"]["version"],
+    }
+    if matrix is None:
+        return _show_wig(folder / "volume.vdb", name, level, properties, context)
+    to_head = head_from_scan(matrix)
+    mesh = load_obj(folder / "head.obj").transformed(to_head)
+    if until == "head":
+        return _show_wig(folder / "volume.vdb", name, level, properties, context, mesh, matrix)
+    guides = Strands.load(folder / "guides.npz").transformed(to_head)
+    hair = Strands.load(folder / "dense.npz").transformed(to_head) if until == "dense" else guides
+    return show_strands(
+        hair,
+        mesh,
+        name,
+        guides=guides,
+        grid=folder / "volume.vdb",
+        head_to_scan=matrix,
+        hair_level=level,
+        colour=colour,
+        properties=properties,
+        context=context,
+    ).collection
+
+
+def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=None) -> bpy.types.Collection:
+    """The wig's volume, and the head in it where it is known, as a collection of the kind `scan`."""
+    summary = summarize(grid, level)
+    with NewData() as new:
+        collection, root = _new_collection(new, name, "scan")
+        scan = _new_empty(new, f"{name} Scan", "scan", root)
+        place = (
+            scene_from_unregistered_scan(summary.low_corner, summary.high_corner)
+            if head_to_scan is None
+            else scene_from_scan(head_to_scan)
+        )
+        scan.matrix_basis = Matrix(place.tolist())
+        collection.objects.link(scan)
+        _enrol(collection, new_volume(new, f"{name} Volume", grid, summary), "volume", scan)
+        if mesh is not None:
+            _enrol(collection, new_head(new, f"{name} Head", mesh), "head", root)
+        for key, value in properties.items():
+            collection[key] = value
+    _link(collection, context)
+    return collection
+
+
+def add_template_head(name: str = "CT2Hair Head", context: bpy.types.Context | None = None) -> bpy.types.Object:
+    """Add the built-in mannequin, its scalp marked and flattened, to the scene at the 3D cursor; returns the object."""
+    context = context or bpy.context
+    with NewData() as new:
+        ob = new_head(new, name, template_head())
+    ob.location = context.scene.cursor.location
+    (context.collection or context.scene.collection).objects.link(ob)
+    context.view_layer.update()
+    return ob
+
+
+def placement(scan: bpy.types.Object, head: bpy.types.Object) -> str:
+    """The setting `head.place` for a head that the user has put where it stands in a scan: 16 numbers, head to scan, mm.
+
+    scan: the empty of an imported scan (role `scan`). head: the template as it is, moved, turned and scaled evenly.
+    Raises CT2HairError where it is scaled unevenly or mirrored.
+    """
+    matrix = np.linalg.inv(np.array(scan.matrix_world, np.float64)) @ np.array(head.matrix_world, np.float64)
+    matrix = matrix @ np.diag([MM, MM, MM, 1.0])
+    try:
+        rigid(matrix)
+    except ValueError:
+        raise CT2HairError(f"'{head.name}' is scaled unevenly or mirrored: give it one scale for all axes") from None
+    return " ".join(f"{value:.9g}" for value in matrix.ravel())
 
 
 def reconstruct(
@@ -362,8 +480,6 @@ def import_strands(
         if not np.isfinite(mesh.uv[mesh.scalp]).all():
             mesh = unwrap(mesh)
     else:
-        from ..head import fit_to_roots, template_head
-
         fitted = fit_to_roots(template_head(), strands.roots)
         to_head = head_from_scan(np.asarray(fitted.matrix))
         mesh, strands = fitted.head.transformed(to_head), strands.transformed(to_head)
