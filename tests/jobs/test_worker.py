@@ -27,7 +27,7 @@ from pathlib import Path
 pipeline = types.ModuleType("ct2hair_addon.pipeline")
 
 
-def reconstruct(scan, out, settings, *, raw_shape, raw_type, observer):
+def reconstruct(scan, out, settings, *, raw_shape, raw_type, observer, until):
     from ct2hair_addon.errors import ScanError
 
     observer.started("scan", "reading the scan")
@@ -168,7 +168,7 @@ def test_the_worker_ends_when_its_starter_is_killed(tmp_path):
 
 def test_a_damaged_job_description_is_refused(tmp_path):
     folder = JobFolder.create(tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2")
-    assert folder.read() == (tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2")
+    assert folder.read() == (tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2", None)
     folder.description.write_text('{"scan": 3')
     with pytest.raises(CT2HairError, match=r"job\.json: not a job description"):
         folder.read()
