@@ -126,7 +126,7 @@ def write_alembic(
     if unit not in _UNITS:
         raise CT2HairError(f"unit '{unit}' is not known; Alembic files are written in {', '.join(_UNITS)}")
     try:
-        from alembic3d import Abc, AbcGeom
+        from alembic3d import Abc, AbcCoreAbstract, AbcGeom
     except ImportError:
         raise CT2HairError("Alembic needs the package alembic3d, which comes with the extension: install it again") from None
     path, layout = Path(path), _Layout(_UNITS[unit], up)
@@ -137,7 +137,7 @@ def write_alembic(
             if frames is not None:
                 render = bpy.context.scene.render
                 seconds = render.fps_base / render.fps
-                sampling = archive.addTimeSampling(Abc.TimeSampling(seconds, frames[0] * seconds))
+                sampling = archive.addTimeSampling(AbcCoreAbstract.TimeSampling(seconds, frames[0] * seconds))
             top = archive.getTop()
             groom = AbcGeom.OXform(top, "groom")
             # Unreal looks for the version on the top node; other readers take it from the groom's own node

@@ -1,7 +1,7 @@
 """Runs inside the Blender under test: a timer that does what the test writes into a folder, and answers beside it.
 
-Each request is a file NUMBER.py of Python; its variable `answer` comes back as NUMBER.json. The longest time that Blender's main
-loop left between two ticks of the timer is kept, so that the test can tell whether the window was held up.
+Each request is a file NUMBER.py of Python; its variable `answer` comes back as NUMBER.json. The longest time that Blender's
+main loop left between two ticks of the timer is kept, so that the test can tell whether the window was held up.
 """
 
 import contextlib

@@ -45,7 +45,9 @@ class DebianBlender:
         if not (folder / "usr/bin/blender").exists() or not (folder / "usr/bin/Xvfb").exists():
             cls._make(folder)
         if not (folder / "proc/self").exists():
-            run = subprocess.run(["mount", "-t", "proc", "proc", str(folder / "proc")], capture_output=True, text=True, check=False)
+            run = subprocess.run(
+                ["mount", "-t", "proc", "proc", str(folder / "proc")], capture_output=True, text=True, check=False
+            )
             if run.returncode:
                 raise Unavailable(f"/proc can't be mounted in {folder}: {run.stderr.strip()}")
         mtab = folder / "etc/mtab"
@@ -151,7 +153,7 @@ class DebianBlender:
     def until(self, code: str, timeout: float = 60.0, every: float = 0.2):
         """Ask again and again until the answer is true; the answer."""
         end = time.monotonic() + timeout
-        while not (answer := self.ask(code)):
+        while not (answer := self.ask(code, timeout)):
             assert time.monotonic() < end, f"waited {timeout:g} s in vain for: {code}"
             time.sleep(every)
         return answer
