@@ -17,7 +17,7 @@ def table() -> str:
     lines = [
         "# All parameters",
         "",
-        "Made by `make manual` from `ct2hair_addon/settings.py`; a test keeps it up to date. On the command line a parameter is",
+        "Made by `make manual` from `ct2hair_addon/settings.py`; a test keeps it current. On the command line a parameter is",
         '`--stage-name`, in JSON `{"stage": {"name": value}}`, in the panel it is under *All Parameters*.',
     ]
     groups = [(stage.name, type(stage.default)) for stage in fields(Settings)] + [("simulation", SimulationSettings)]

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..cache import cache_folder
 from ..settings import Settings
 from .folder import JobFolder
 from .messages import ERROR, PROGRESS, RESULT, STATUS, WARNING, Message
@@ -227,4 +228,7 @@ def _environment(paths: Iterable[str], own: bool, more: Mapping[str, str] | None
     folders = dict.fromkeys([str(ROOT), *map(str, paths), *inherited])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), PARENT: str(os.getpid()), **(more or {})}
     environment.pop("PYTHONHOME", None)
+    kernels = environment.get("NUMBA_CACHE_DIR", "")
+    if kernels.startswith(str(cache_folder() / "kernels")):
+        del environment["NUMBA_CACHE_DIR"]  # ours, for the name that we are loaded by; the worker is loaded by another
     return environment

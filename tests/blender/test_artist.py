@@ -329,7 +329,11 @@ def test_parameters_go_to_json_and_back(tmp_path):
 
 
 def test_a_preset_is_kept_in_a_file_and_played(tmp_path, monkeypatch):
-    monkeypatch.setattr(bpy.utils, "user_resource", lambda kind, path="", create=False: str(tmp_path / path))
+    def user_resource(kind, path="", create=False):
+        (tmp_path / path).mkdir(parents=True, exist_ok=True)
+        return str(tmp_path / path)
+
+    monkeypatch.setattr(bpy.utils, "user_resource", user_resource)
     owner = bpy.context.scene.ct2hair
     owner.settings.guides.step, owner.settings.scan.spacing = 0.25, 0.7
     assert bpy.ops.ct2hair.preset_add(name="fine") == {"FINISHED"}

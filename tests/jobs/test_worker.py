@@ -180,3 +180,14 @@ def test_messages_come_back_and_other_lines_are_refused():
     for line in ("hello", "[]", '{"kind": "gossip"}'):
         with pytest.raises(ValueError):
             Message.from_line(line)
+
+
+def test_the_worker_keeps_its_kernels_apart_from_blender_s(monkeypatch):
+    """Loaded as bl_ext..., the package compiles kernels that the worker, loaded by its own name, could not read."""
+    from ct2hair_addon.cache import cache_folder
+    from ct2hair_addon.jobs import client
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache_folder() / "kernels" / "bl_ext.user_default.ct2hair.ct2hair_addon"))
+    assert "NUMBA_CACHE_DIR" not in client._environment((), own=True)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/somewhere/else")
+    assert client._environment((), own=True)["NUMBA_CACHE_DIR"] == "/somewhere/else"
