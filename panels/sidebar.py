@@ -79,11 +79,11 @@ class CT2HAIR_PT_thresholds(_Sidebar, bpy.types.Panel):
                     column.label(text=line, icon="ERROR" if number == 0 else "BLANK1")
         names = ("air", "hair", "knots", "solid")
         for name in names:
-            row = column.row(align=True)
-            row.prop(chosen, name)
             found = getattr(inspection.thresholds, name, None) if inspection is not None else None
+            label = name.capitalize()
             if not getattr(chosen, name) and found is not None:
-                row.label(text=f"found {found:.6g}")
+                label += f" (found {found:.0f})" if abs(found) >= 100 else f" (found {found:.3g})"
+            column.prop(chosen, name, text=label)
         row = column.row(align=True)
         row.operator("ct2hair.thresholds", text="Change by Hand")
         row.operator("ct2hair.thresholds", text="Automatic").automatic = True
@@ -105,7 +105,8 @@ class CT2HAIR_PT_slices(_Sidebar, bpy.types.Panel):
         column.prop(properties, "slice_at", slider=True)
         column.template_icon(icon_value=look.slice_icon(context), scale=PICTURE)
         size = " × ".join(f"{n * s / 10:.1f}" for n, s in zip(inspection.shape, inspection.spacing, strict=True))
-        column.label(text=f"{' × '.join(map(str, inspection.shape))} voxels, {size} cm")
+        column.label(text=f"{' × '.join(map(str, inspection.shape))} voxels")
+        column.label(text=f"{size} cm")
 
 
 class CT2HAIR_PT_cloud(_Sidebar, bpy.types.Panel):
@@ -172,7 +173,7 @@ class CT2HAIR_PT_reconstruct(_Sidebar, bpy.types.Panel):
         column.prop(properties, "folder")
         cost = look.cost(context)
         if cost is not None:
-            column.label(text=f"About {max(cost[0], 1):.0f} minutes and {cost[1]:.1f} GB", icon="TIME")
+            column.label(text=f"About {max(cost[0], 1):.0f} min, {cost[1]:.1f} GB", icon="TIME")
         column = self.column()
         if properties.unfinished and current.job is None:
             box = column.box()
@@ -271,11 +272,11 @@ class CT2HAIR_PT_result(_Sidebar, bpy.types.Panel):
     def _draw_scores(column, result):
         report = result.report
         for size, score in report.get("scores", {}).get("after", {}).items():
-            text = f"Overlap with the scan at {size} mm: {score['iou']:.0%}"
+            text = f"Overlap at {size} mm: {score['iou']:.0%}"
             column.label(text=text, icon="BLANK1")
         support = report.get("hair", {}).get("mean_support")
         if support is not None:
-            column.label(text=f"Backed by the scan: {support:.0%} of a strand", icon="BLANK1")
+            column.label(text=f"Backed by the scan: {support:.0%}", icon="BLANK1")
         page = result.folder / "report.html"
         if page.is_file():
             column.operator("wm.path_open", text="Open Report", icon="URL").filepath = str(page)

@@ -31,7 +31,7 @@ def threshold_values(inspection: Inspection, settings: ScanSettings) -> dict[str
     return values
 
 
-def histogram_picture(inspection: Inspection, settings: ScanSettings, width: int = 512, height: int = 256) -> np.ndarray:
+def histogram_picture(inspection: Inspection, settings: ScanSettings, width: int = 512, height: int = 512) -> np.ndarray:
     """The histogram, its counts on a logarithmic scale, with a line for each threshold: dashed where it was found, whole
     where the settings give it."""
     picture = np.tile(_GROUND, (height, width, 1))

@@ -176,9 +176,9 @@ def _run(result, guides: Strands, settings, first: int, last: int, progress: Pro
             place[:3, 3] /= MM
             if not np.allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-3):
                 raise CT2HairError("the head is scaled: apply its scale (Ctrl A) before a simulation")
-            mesh = head_mesh(result.head, evaluated=True)
-            if shape is None or not np.array_equal(mesh.vertices, shape):
-                shape, obstacle = mesh.vertices, Obstacle.of(Head(mesh))
+            vertices = _shown_vertices(result.head)
+            if shape is None or not np.array_equal(vertices, shape):
+                shape, obstacle = vertices, Obstacle.of(Head(head_mesh(result.head, evaluated=True)))
             local = follower.points().reshape(rest.shape)
             world = local @ place[:3, :3].T + place[:3, 3]
             if simulation is None:
@@ -191,6 +191,18 @@ def _run(result, guides: Strands, settings, first: int, last: int, progress: Pro
     finally:
         follower.remove()
     return samples
+
+
+def _shown_vertices(ob: bpy.types.Object) -> np.ndarray:
+    """(V * 3,) float32: the vertices of a mesh object as the scene shows it, in its own frame."""
+    source = ob.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = source.to_mesh()
+    try:
+        vertices = np.empty(len(mesh.vertices) * 3, np.float32)
+        mesh.vertices.foreach_get("co", vertices)
+        return vertices
+    finally:
+        source.to_mesh_clear()
 
 
 class _Follower:

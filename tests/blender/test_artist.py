@@ -226,7 +226,7 @@ def test_the_histogram_shows_thresholds_found_and_chosen(inspection):
         column = picture[:, int((value - low) / (high - low) * 511), :3]
         share = np.isclose(column, THRESHOLD_COLOURS[name]).all(axis=1).mean()
         assert share == (1.0 if name == "knots" else pytest.approx(0.625, abs=0.01)), name
-    assert picture[0, :, 0].max() > 0.5 and picture.shape == (256, 512, 4)
+    assert picture[0, :, 0].max() > 0.5 and picture.shape == (512, 512, 4)
 
 
 def test_a_slice_shows_the_lump_where_it_is(inspection):
