@@ -82,7 +82,7 @@ class CT2HAIR_PT_thresholds(_Sidebar, bpy.types.Panel):
             found = getattr(inspection.thresholds, name, None) if inspection is not None else None
             label = name.capitalize()
             if not getattr(chosen, name) and found is not None:
-                label += f" (found {found:.0f})" if abs(found) >= 100 else f" (found {found:.3g})"
+                label += f" ({found:.0f})" if abs(found) >= 100 else f" ({found:.3g})"
             column.prop(chosen, name, text=label)
         row = column.row(align=True)
         row.operator("ct2hair.thresholds", text="Change by Hand")
