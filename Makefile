@@ -8,7 +8,7 @@ PYTHON_BPY52 := $(shell for python in python3.13 $(PYENV_ROOT)/versions/3.13*/bi
 RUN := .venv/bin/python
 TORCH ?= any
 
-.PHONY: setup demo test lint extension fetch lock venv52 clean
+.PHONY: setup demo test test-gui manual lint extension fetch lock venv52 clean
 
 ## .venv: Blender 4.5 LTS as a Python module, the engine's packages and the test tools, from wheels/lock.toml
 setup:
@@ -23,6 +23,14 @@ demo: setup
 
 test: setup
 	$(RUN) -m pytest
+
+## the extension in a real window under Xvfb (Debian sid's Blender in out/gui/debian; root and debootstrap); pictures in out/gui
+test-gui: setup
+	CT2HAIR_GUI=1 $(RUN) -m pytest tests/gui -s
+
+## docs/settings.md, anew from ct2hair_addon/settings.py
+manual: setup
+	$(RUN) docs/settings_table.py
 
 ## the style, the layers of the house (import-linter), and Blender's own validation of the manifest
 lint: setup

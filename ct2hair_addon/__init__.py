@@ -7,4 +7,5 @@ from .cache import cache_folder
 __version__ = "0.1.0"
 
 # numba reads this when it first compiles: compiled kernels go to the user's cache, not into the installed extension.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "kernels"))
+# a folder for each name that the package is loaded by: a kernel that Blender compiled as bl_ext... can't be read by the worker
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "kernels" / __name__))

@@ -1,8 +1,10 @@
-"""The command line: synthesize | reconstruct | evaluate | benchmark | convert | train-prior | study-blending.
+"""The command line.
 
-The options of `reconstruct` are made from `settings.py`.
+synthesize | inspect | reconstruct | batch | evaluate | benchmark | convert | train-prior | study-blending.
 
-Exit codes: 0 done, 1 refused with a clear error, 2 wrong usage, 130 cancelled.
+Options of `reconstruct` are made from `settings.py`.
+
+Exit codes: 0 done, 1 refused with a clear error (`batch`: one scan or more failed), 2 wrong usage, 130 cancelled.
 """
 
 from __future__ import annotations
@@ -12,13 +14,14 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from . import __version__
 from .errors import Cancelled, CT2HairError
-from .settings import PRESETS, Settings, parameters
+from .settings import PRESETS, STOPS, Settings, parameters
 
 DONE, REFUSED, WRONG_USAGE, STOPPED = 0, 1, 2, 130
 SHORT_NAMES = {
@@ -61,7 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ct2hair {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (
-        _add_synthesize, _add_reconstruct, _add_evaluate, _add_benchmark, _add_convert, _add_train_prior, _add_study_blending,
+        _add_synthesize, _add_inspect, _add_reconstruct, _add_batch, _add_evaluate, _add_benchmark, _add_convert,
+        _add_train_prior, _add_study_blending,
     ):  # fmt: skip
         add(commands)
     return parser
@@ -79,6 +83,7 @@ def _add_reconstruct(commands) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for hair.npz, guides.npz, head.obj and the report")
     parser.add_argument("--preset", choices=list(PRESETS), default="standard", help="speed against quality")
     parser.add_argument("--settings", type=Path, help="JSON file of settings, over the preset")
+    parser.add_argument("--until", choices=STOPS, help="stop after this stage; the same call without it goes on from there")
     _add_raw_options(parser)
     for name, known in parameters():
         short = SHORT_NAMES.get(name)
@@ -97,6 +102,126 @@ def _add_reconstruct(commands) -> None:
             metavar=None if known.metadata["choices"] else option.lstrip("-").split("-")[-1].upper(),
             help=text,
         )
+
+
+def _add_inspect(commands) -> None:
+    parser = _add_command(commands, "inspect", _inspect, "look at a scan: its size, histogram and thresholds")
+    parser.add_argument("scan", type=Path, help="the CT volume")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="also keep histogram and a small copy as .npz")
+    parser.add_argument("--settings", type=Path, help="JSON file of settings")
+    parser.add_argument("--spacing", type=float, default=0.0, metavar="MM", help="voxel size; 0 takes it from the file [mm]")
+    _add_raw_options(parser)
+
+
+def _inspect(chosen: argparse.Namespace) -> int:
+    from .volume import inspect_scan, open_scan
+
+    settings = Settings().changed(_settings_file(chosen.settings) if chosen.settings else {})
+    if chosen.spacing:
+        settings = settings.changed({"scan.spacing": chosen.spacing})
+    observer = TerminalObserver()
+    with open_scan(chosen.scan, settings.scan, chosen.raw_shape, chosen.raw_type) as reader:
+        found = inspect_scan(reader, settings.scan, lambda done, total: observer.progressed("scan", 0.0, done / total, None))
+    if chosen.out:
+        found.save(chosen.out)
+    size = " x ".join(f"{n * s / 10:.1f}" for n, s in zip(found.shape, found.spacing, strict=True))
+    print(f"{' x '.join(map(str, found.shape))} voxels, {size} cm: {chosen.scan}")
+    if found.thresholds is None:
+        raise CT2HairError(found.problem)
+    for name in ("air", "noise", "strand", "hair", "knots", "solid"):
+        print(f"{name:8} {getattr(found.thresholds, name)}")
+    print(f"about {found.hair_voxels / 1e6:.1f} million hair voxels")
+    return DONE
+
+
+SCAN_ENDINGS = (".vdb", ".npy", ".raw", ".tif", ".tiff", ".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+"""Files that `batch` takes for scans in a folder; so are folders of DICOM or TIFF slices in it."""
+
+
+def _add_batch(commands) -> None:
+    parser = _add_command(commands, "batch", _batch, "reconstruct many scans; one that fails doesn't stop the others")
+    parser.add_argument("source", type=Path, help="a folder of scans, or a JSON file: [{scan, name, preset, settings}, ...]")
+    parser.add_argument("--out", type=Path, required=True, help="folder; each scan's result goes to a folder of its name in it")
+    parser.add_argument("--preset", choices=list(PRESETS), default="standard", help="where the JSON names none")
+    parser.add_argument("--settings", type=Path, help="JSON file of settings for all, over the preset")
+
+
+def _batch(chosen: argparse.Namespace) -> int:
+    jobs = _batch_jobs(chosen)
+    from . import pipeline  # late: it loads numba and torch
+
+    outcomes = []
+    for number, (name, scan, settings) in enumerate(jobs, 1):
+        print(f"ct2hair: {number} of {len(jobs)}: {scan}", file=sys.stderr, flush=True)
+        begun, out = time.monotonic(), chosen.out / name
+        outcome = {"name": name, "scan": str(scan), "out": str(out), "state": "failed", "strands": 0, "error": ""}
+        try:
+            result = pipeline.reconstruct(scan, out, settings(), observer=TerminalObserver())
+            outcome |= {"state": "done", "strands": len(result.hair)}
+        except (CT2HairError, MemoryError, OSError) as error:
+            outcome["error"] = str(error) or type(error).__name__
+        except (Cancelled, KeyboardInterrupt):
+            raise
+        except Exception as error:  # a fault of ours in one scan is no reason to leave the others undone
+            traceback.print_exc()
+            outcome["error"] = f"unforeseen {type(error).__name__}: {error}"
+        outcome["seconds"] = round(time.monotonic() - begun, 1)
+        outcomes.append(outcome)
+        chosen.out.mkdir(parents=True, exist_ok=True)
+        (chosen.out / "batch.json").write_text(json.dumps(outcomes, indent=2))
+    failed = [outcome for outcome in outcomes if outcome["state"] == "failed"]
+    for outcome in outcomes:
+        what = outcome["error"] if outcome in failed else f"{outcome['strands']} strands"
+        print(f"{outcome['state']:7}{outcome['seconds']:8.0f} s  {outcome['name']}: {what}")
+    print(f"{len(outcomes) - len(failed)} of {len(outcomes)} done: {chosen.out / 'batch.json'}")
+    return REFUSED if failed else DONE
+
+
+def _batch_jobs(chosen: argparse.Namespace) -> list[tuple[str, Path, Callable[[], Settings]]]:
+    """(name, scan, its settings when asked for) of each scan; bad settings of one are that one's failure."""
+    shared = _settings_file(chosen.settings) if chosen.settings else {}
+    if chosen.source.is_dir():
+        entries = [{"scan": str(path)} for path in sorted(chosen.source.iterdir()) if _is_scan(path)]
+        base = Path()
+    else:
+        try:
+            entries, base = json.loads(chosen.source.read_text()), chosen.source.parent
+        except OSError as error:
+            raise CT2HairError(f"{chosen.source}: can't be read ({error.strerror}); name a folder or a JSON file") from error
+        except ValueError as error:
+            raise CT2HairError(f"{chosen.source}: not JSON ({error})") from error
+        if not isinstance(entries, list) or not all(isinstance(e, dict) and isinstance(e.get("scan"), str) for e in entries):
+            raise CT2HairError(
+                f'{chosen.source}: expected a list [{{"scan": FILE, "name": ..., "preset": ..., "settings": ...}}]'
+            )
+    if not entries:
+        raise CT2HairError(f"{chosen.source}: there is no scan; known are {', '.join(SCAN_ENDINGS)} and folders of slices")
+    jobs, names = [], set()
+    for entry in entries:
+        scan = base / entry["scan"]
+        name = wanted = str(entry.get("name") or _stem(scan))
+        while name in names:
+            name = f"{wanted}_{sum(known.startswith(wanted) for known in names)}"
+        names.add(name)
+
+        def settings(entry=entry) -> Settings:
+            nested = entry.get("settings", {})
+            flat = {f"{stage}.{key}": value for stage, group in nested.items() for key, value in group.items()}
+            return Settings.preset(entry.get("preset", chosen.preset)).changed({**shared, **flat})
+
+        jobs.append((name, scan, settings))
+    return jobs
+
+
+def _is_scan(path: Path) -> bool:
+    if path.is_dir():
+        return any(file.suffix.lower() in (".dcm", ".tif", ".tiff") for file in path.iterdir())
+    return path.name.lower().endswith(SCAN_ENDINGS)
+
+
+def _stem(path: Path) -> str:
+    ending = next((known for known in sorted(SCAN_ENDINGS, key=len, reverse=True) if path.name.lower().endswith(known)), "")
+    return path.name[: len(path.name) - len(ending)] or "scan"
 
 
 def _add_raw_options(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +252,11 @@ def _reconstruct(chosen: argparse.Namespace) -> int:
         raw_shape=chosen.raw_shape,
         raw_type=chosen.raw_type,
         observer=TerminalObserver(),
+        until=chosen.until,
     )
+    if result is None:
+        print(f"stopped after the stage '{chosen.until}': {chosen.out / 'stage.json'}")
+        return DONE
     print(
         f"{len(result.hair)} strands from {len(result.guides)} guides in {result.seconds:.0f} s: {chosen.out / 'hair.npz'}\n"
         f"report: {chosen.out / 'report.html'}"
@@ -222,9 +351,8 @@ def _synthesize(chosen: argparse.Namespace) -> int:
         mannequin=not chosen.no_mannequin,
         net=not chosen.no_net,
     )
-    print(
-        f"{len(strands)} strands, {' x '.join(map(str, made.description['shape']))} voxels of {chosen.spacing} mm: {chosen.out}"
-    )
+    voxels = " x ".join(map(str, made.description["shape"]))
+    print(f"{len(strands)} strands, {voxels} voxels of {chosen.spacing} mm: {chosen.out}")
     return DONE
 
 

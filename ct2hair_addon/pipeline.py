@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import os
 import platform
 import sys
@@ -28,7 +29,7 @@ from .measure import Meter, machine_memory
 from .orientation import OrientationField, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, refine
-from .settings import Settings
+from .settings import STOPS, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
 
@@ -103,7 +104,8 @@ def reconstruct(
     raw_type: str | None = None,
     template: HeadMesh | None = None,
     observer: Observer | None = None,
-) -> Reconstruction:
+    until: str | None = None,
+) -> Reconstruction | None:
     """Reconstruct the hair of a scan into the folder `out`.
 
     Writes hair.npz, guides.npz (`Strands`, mm, scan frame), head.obj, volume.vdb (the wig's density), report.json and
@@ -111,10 +113,14 @@ def reconstruct(
     last one whose input and settings are unchanged.
 
     raw_shape (x, y, z) and raw_type (a numpy type, "<u2" say) describe a raw file. template: a head mesh in the head frame
-    instead of `settings.head.mesh`. Raises CT2HairError (bad input, said in a sentence) and Cancelled (by the observer).
+    instead of `settings.head.mesh`. until: one of `STOPS`: stop after that stage, write what there is by then (volume.vdb,
+    head.obj, guides.npz, dense.npz) with stage.json, and return None. Raises CT2HairError (bad input, said in a sentence)
+    and Cancelled (by the observer).
     """
     settings = settings or Settings()
-    job = _Job(Path(scan), Path(out), settings, raw_shape, raw_type, template, observer or Silent())
+    if until is not None and until not in STOPS:
+        raise CT2HairError(f"unknown stage '{until}' to stop after; there are {', '.join(STOPS)}")
+    job = _Job(Path(scan), Path(out), settings, raw_shape, raw_type, template, observer or Silent(), until)
     with _own_folder(job.out), _threads(settings.run.threads):
         return job.run()
 
@@ -122,12 +128,13 @@ def reconstruct(
 class _Job:
     """One run through the stages: the input, the keys of the checkpoints, and what each stage cost."""
 
-    def __init__(self, scan, out, settings, raw_shape, raw_type, template, observer) -> None:
+    def __init__(self, scan, out, settings, raw_shape, raw_type, template, observer, until=None) -> None:
         self.scan: Path = scan
         self.out: Path = out
         self.settings: Settings = settings
         self.raw = {"shape": raw_shape and [int(n) for n in raw_shape], "dtype": raw_type}
         self.observer: Observer = observer
+        self.until: str | None = until
         self.template = template or self._template()
         self.checkpoints = Checkpoints(out / "checkpoints", _TYPES)
         self.keys = self._keys()
@@ -136,12 +143,14 @@ class _Job:
         self.begun = time.monotonic()
         self.resumed_share = 0.0
 
-    def run(self) -> Reconstruction:
+    def run(self) -> Reconstruction | None:
         settings, seed = self.settings, self.settings.run.seed
         wig = self._stage("scan", self._import)
         self._warn(wig.warnings)
         self._check_memory(wig.density)
         level = wig.hair_level
+        if self.until == "scan":
+            return self._stop(wig)
         registration = self._stage(
             "head",
             lambda progress: register_head(
@@ -152,7 +161,11 @@ class _Job:
         head = Head(registration.head)
         density, net_tally = remove_hairnet(wig.density, head, settings.head)
         wig = dataclasses.replace(wig, density=density)  # the net's voxels are needed no more
+        if self.until == "head":
+            return self._stop(wig, registration)
         guides = self._guides(density, level, head)
+        if self.until == "guides":
+            return self._stop(wig, registration, guides=guides.strands)
 
         def fill(progress: Progress) -> Dense:
             count = settings.interpolation.strands
@@ -162,6 +175,8 @@ class _Job:
             return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
 
         dense = self._stage("dense", fill)
+        if self.until == "dense":
+            return self._stop(wig, registration, guides=guides.strands, dense=dense.strands)
         # who asks for a number of strands gets that number
         wanted = dataclasses.replace(
             settings.refinement, prune=settings.refinement.prune and not settings.interpolation.strands
@@ -178,6 +193,26 @@ class _Job:
             "refinement": refined.tally,
         }
         return self._write(wig, registration, head, guides.strands, dense.strands, refined, tallies)
+
+    def _stop(self, wig: WigScan, registration: Registration | None = None, **strands: Strands) -> None:
+        """Write what there is after the stage that the run was to stop at, stage.json last."""
+        if registration is not None:
+            registration.head.save(self.out / "head.obj")
+        for name, some in strands.items():
+            some.save(self.out / f"{name}.npz")
+        known = {
+            "until": self.until,
+            "program": {"version": __version__},
+            "scan": {"file": self.scan.name, "hair_level": wig.hair_level},
+            "thresholds": dataclasses.asdict(wig.thresholds),
+            "head": {} if registration is None else {"head_to_scan": np.asarray(registration.matrix, float).tolist()},
+            "settings": self.settings.to_dict(),
+            "stages": self.costs,
+            "warnings": self.warnings,
+        }
+        beside = self.out / ".stage.part.json"
+        beside.write_text(json.dumps(known, indent=2), encoding="utf-8")
+        beside.replace(self.out / "stage.json")
 
     def _import(self, progress: Progress) -> WigScan:
         reader = open_scan(self.scan, self.settings.scan, **self.raw)

@@ -14,6 +14,8 @@ from typing import Any
 
 from .errors import SettingsError
 
+STOPS = ("scan", "head", "guides", "dense")
+"""Stages of the pipeline that a reconstruction may stop after, to be looked at; without, it goes through."""
 AXES = ("auto", "+x", "-x", "+y", "-y", "+z", "-z")
 
 
@@ -43,6 +45,11 @@ class HeadSettings:
     mesh: str = parameter("", "OBJ file of a head with a group or material 'scalp'; empty takes the built-in mannequin")
     face: str = parameter("auto", "scan axis that the face looks along", choices=AXES)
     up: str = parameter("auto", "scan axis that points to the crown", choices=AXES)
+    place: str = parameter(
+        "",
+        "where the head stands in the scan, by hand: the 16 numbers, by row, of the matrix head to scan; empty finds it",
+        unit="mm",
+    )
     net_clearance: float = parameter(
         1.5, "hair voxels closer to the scalp than this are taken for the hairnet", unit="mm", low=0.0, high=10.0
     )
@@ -205,11 +212,35 @@ class SynthesisSettings:
 
     def changed(self, changes: Mapping[str, Any]) -> SynthesisSettings:
         """These settings with some set, `{"snr": 2.0}`. Raises SettingsError for bad ones."""
-        known = {known_field.name: known_field for known_field in fields(self)}
-        for name in changes:
-            if name not in known:
-                raise SettingsError(f"unknown setting '{name}' of the synthesis; there are {', '.join(known)}")
-        return dataclasses.replace(self, **{name: _checked(name, known[name], value) for name, value in changes.items()})
+        return _changed(self, changes, "synthesis")
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Hair in motion (ours; the paper has none). No part of a reconstruction."""
+
+    guides: int = parameter(1000, "strands simulated at most; the others follow them", low=1, high=100_000)
+    points: int = parameter(24, "points of each simulated strand", low=4, high=256)
+    stiffness: float = parameter(
+        0.7, "how firmly hair keeps its curls and bends: 0 is wet string, 1 is wire", low=0.0, high=1.0
+    )
+    hold: float = parameter(
+        3.0, "pull back to where the hair stood in the scan: 0 none, 20 hair spray", unit="1/s", low=0.0, high=1000.0
+    )
+    gravity: float = parameter(
+        0.5,
+        "share of the scene's gravity: the scan hangs by it already, so 0 leaves hair on a still head at rest",
+        low=-10.0,
+        high=10.0,
+    )
+    drag: float = parameter(4.0, "share of its speed that hair loses to the air", unit="1/s", low=0.0, high=1000.0)
+    wind_x: float = parameter(0.0, "wind along x of the scene", unit="m/s", low=-100.0, high=100.0)
+    wind_y: float = parameter(0.0, "wind along y of the scene", unit="m/s", low=-100.0, high=100.0)
+    wind_z: float = parameter(0.0, "wind along z of the scene", unit="m/s", low=-100.0, high=100.0)
+
+    def changed(self, changes: Mapping[str, Any]) -> SimulationSettings:
+        """These settings with some set, `{"wind_y": 2.0}`. Raises SettingsError for bad ones."""
+        return _changed(self, changes, "simulation")
 
 
 @dataclass(frozen=True)
@@ -299,6 +330,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 """Named changes to the defaults: speed against quality, and the paper's own parameters."""
+
+
+def _changed(settings, changes: Mapping[str, Any], of: str):
+    """A dataclass of parameters with some set. Raises SettingsError for unknown and bad ones."""
+    known = {known_field.name: known_field for known_field in fields(settings)}
+    for name in changes:
+        if name not in known:
+            raise SettingsError(f"unknown setting '{name}' of the {of}; there are {', '.join(known)}")
+    return dataclasses.replace(settings, **{name: _checked(name, known[name], value) for name, value in changes.items()})
 
 
 def _checked(name: str, known: dataclasses.Field, value: Any) -> Any:

@@ -1,8 +1,36 @@
 """The operators: thin faces of the scripting API (`ct2hair_addon.scene`) and of the background jobs."""
 
-from . import command, output, properties, reconstruct, scan
+from . import (
+    command,
+    exchange,
+    head,
+    look,
+    output,
+    preferences,
+    presets,
+    properties,
+    reconstruct,
+    result,
+    scan,
+    simulation,
+    translations,
+)
 
-_MODULES = (properties, scan, reconstruct, output, command)
+_MODULES = (
+    preferences,
+    properties,
+    scan,
+    look,
+    head,
+    reconstruct,
+    result,
+    simulation,
+    exchange,
+    output,
+    presets,
+    command,
+    translations,
+)
 
 
 def register() -> None:

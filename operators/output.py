@@ -10,7 +10,7 @@ from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 
 
-class _OfResult:
+class OfResult:
     """What needs a result in the scene."""
 
     @classmethod
@@ -21,7 +21,7 @@ class _OfResult:
         return True
 
 
-class CT2HAIR_OT_export(_OfResult, bpy.types.Operator):
+class CT2HAIR_OT_export(OfResult, bpy.types.Operator):
     """Export the result of the active object (or the newest one): .blend, Alembic groom, USD, picture, report"""
 
     bl_idname = "ct2hair.export"
@@ -40,17 +40,73 @@ class CT2HAIR_OT_export(_OfResult, bpy.types.Operator):
     unit: EnumProperty(
         name="Alembic unit",
         description="Unit of the coordinates in the Alembic file",
-        items=[("m", "Metres", "Houdini, Blender"), ("cm", "Centimetres", "Unreal, Maya")],
+        items=[
+            ("m", "Metres", "Houdini, Blender"),
+            ("cm", "Centimetres", "Unreal, Maya"),
+            ("mm", "Millimetres", "As the scan"),
+        ],
         default="m",
+    )
+    up: EnumProperty(
+        name="Alembic up axis",
+        description="Axis of the Alembic file that points up",
+        items=[("y", "Y", "Unreal, Houdini, Maya"), ("z", "Z", "As in Blender")],
+        default="y",
+    )
+    animated: BoolProperty(
+        name="Animated",
+        description="Alembic and USD hold a sample a frame over the scene's frame range, for hair that is simulated or whose "
+        "head moves. Off, the hair as it stands now",
+        default=False,
     )
     usd: BoolProperty(
         name="USD (.usda)", description="Hair, guides and head; attributes as primvars; metres, Z up", default=True
+    )
+    bin: BoolProperty(name="CT2Hair (.bin)", description="Points, directions and labels of the strands", default=False)
+    data: BoolProperty(name="USC-HairSalon (.data)", description="Points of the strands", default=False)
+    hair: BoolProperty(name="Cem Yuksel (.hair)", description="Points of the strands", default=False)
+    npz: BoolProperty(name="CT2Hair for Blender (.npz)", description="Strands with all their attributes", default=False)
+    strand_unit: EnumProperty(
+        name="Strand file unit",
+        description="Unit of the coordinates in .bin, .data, .hair and .npz",
+        items=[(unit, unit, f"Coordinates in {unit}") for unit in scene.STRAND_UNITS],
+        default="mm",
+    )
+    strand_up: EnumProperty(
+        name="Strand file up axis",
+        description="Axis that points up in .bin, .data, .hair and .npz",
+        items=[("z", "Z", "As in Blender"), ("y", "Y", "USC-HairSalon, Cem Yuksel")],
+        default="z",
     )
     picture: BoolProperty(name="Picture (render.png)", description="A Cycles picture; takes a minute or more", default=False)
 
     def invoke(self, context, event):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(self, "name")
+        column = layout.column(heading="Scene")
+        column.prop(self, "blend")
+        column.prop(self, "picture")
+        column = layout.column(heading="Groom")
+        column.prop(self, "alembic")
+        column.prop(self, "usd")
+        column.prop(self, "animated")
+        column = layout.column()
+        column.active = self.alembic
+        column.prop(self, "unit")
+        column.prop(self, "up")
+        column = layout.column(heading="Strands")
+        for ending in scene.STRAND_FORMATS:
+            column.prop(self, ending)
+        column = layout.column()
+        column.active = any(getattr(self, ending) for ending in scene.STRAND_FORMATS)
+        column.prop(self, "strand_unit")
+        column.prop(self, "strand_up")
 
     def execute(self, context):
         formats = tuple(name for name in scene.FORMATS if getattr(self, name))
@@ -59,7 +115,17 @@ class CT2HAIR_OT_export(_OfResult, bpy.types.Operator):
             self.report({"ERROR"}, "Nothing to export: choose a folder and at least one format")
             return {"CANCELLED"}
         try:
-            written = scene.export_all(scene.active_result(context), folder, formats=formats, name=self.name, unit=self.unit)
+            written = scene.export_all(
+                scene.active_result(context),
+                folder,
+                formats=formats,
+                name=self.name,
+                unit=self.unit,
+                up=self.up,
+                strand_unit=self.strand_unit,
+                strand_up=self.strand_up,
+                frames=(context.scene.frame_start, context.scene.frame_end) if self.animated else None,
+            )
         except (CT2HairError, OSError, RuntimeError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -67,7 +133,7 @@ class CT2HAIR_OT_export(_OfResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class CT2HAIR_OT_render(_OfResult, bpy.types.Operator, ExportHelper):
+class CT2HAIR_OT_render(OfResult, bpy.types.Operator, ExportHelper):
     """Render a picture of the result with Cycles in a studio of its own; the scene stays as it is"""
 
     bl_idname = "ct2hair.render"
@@ -102,7 +168,42 @@ class CT2HAIR_OT_render(_OfResult, bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
-class CT2HAIR_OT_hair_colour(_OfResult, bpy.types.Operator):
+class CT2HAIR_OT_turntable(OfResult, bpy.types.Operator):
+    """Render pictures all round the head with Cycles, the lights turning with the camera; the scene stays as it is"""
+
+    bl_idname = "ct2hair.turntable"
+    bl_label = "Render Turntable"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(name="Folder", description="Where turntable_0000.png and on are written", subtype="DIR_PATH")
+    filter_folder: BoolProperty(default=True, options={"HIDDEN"})
+    frames: IntProperty(name="Pictures", description="Pictures in one turn", default=24, min=2, max=720)
+    samples: IntProperty(
+        name="Samples", description="Cycles samples a pixel: more are cleaner and slower", default=48, min=1, max=4096
+    )
+    size: IntProperty(name="Size", description="Edge of each picture. Unit: pixels", default=600, min=16, max=8192)
+
+    def invoke(self, context, event):
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        if not self.directory:
+            self.report({"ERROR"}, "Choose a folder for the pictures")
+            return {"CANCELLED"}
+        folder = Path(bpy.path.abspath(self.directory))
+        try:
+            pictures = scene.render_turntable(
+                scene.active_result(context), folder, frames=self.frames, samples=self.samples, size=self.size
+            )
+        except (CT2HairError, OSError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Rendered {len(pictures)} pictures to {folder}")
+        return {"FINISHED"}
+
+
+class CT2HAIR_OT_hair_colour(OfResult, bpy.types.Operator):
     """Give the hair's material the scene's hair colour"""
 
     bl_idname = "ct2hair.hair_colour"
@@ -118,7 +219,7 @@ class CT2HAIR_OT_hair_colour(_OfResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (CT2HAIR_OT_export, CT2HAIR_OT_render, CT2HAIR_OT_hair_colour)
+CLASSES = (CT2HAIR_OT_export, CT2HAIR_OT_render, CT2HAIR_OT_turntable, CT2HAIR_OT_hair_colour)
 
 
 def register() -> None:

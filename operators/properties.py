@@ -2,6 +2,7 @@
 
 # No `from __future__ import annotations` here: Blender reads the annotations of property groups as objects.
 import struct
+from dataclasses import fields
 from typing import Any
 
 import bpy
@@ -14,8 +15,8 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..ct2hair_addon.scene import HAIR_COLOURS, ROLE, SCALP_GROUP
-from ..ct2hair_addon.settings import PRESETS, Settings, parameters
+from ..ct2hair_addon.scene import DENSITY_PRESETS, HAIR_COLOURS, REGIONS, ROLE, SCALP_GROUP
+from ..ct2hair_addon.settings import PRESETS, Settings, SimulationSettings, parameters
 
 SUBTYPES = {"head.mesh": "FILE_PATH"}
 """Text parameters that are paths: what the panel's field does with them."""
@@ -65,6 +66,14 @@ def _stage_groups() -> dict[str, type]:
 
 
 STAGES = _stage_groups()
+CT2HAIR_PG_simulation = type(
+    "CT2HAIR_PG_simulation",
+    (bpy.types.PropertyGroup,),
+    {
+        "__doc__": "All parameters of a simulation.",
+        "__annotations__": {known.name: _property(known.name, known) for known in fields(SimulationSettings)},
+    },
+)
 
 CT2HAIR_PG_settings = type(
     "CT2HAIR_PG_settings",
@@ -121,6 +130,55 @@ class CT2HAIR_PG_scene(bpy.types.PropertyGroup):
         poll=_may_be_head,
     )
     settings: PointerProperty(type=CT2HAIR_PG_settings)
+    simulation: PointerProperty(type=CT2HAIR_PG_simulation)
+    unfinished: StringProperty(
+        name="Unfinished job", description="Folder of the job that runs, or ran when the file was saved", subtype="DIR_PATH"
+    )
+    slice_axis: EnumProperty(
+        name="Slice",
+        description="Axis of the scan that the slice lies across",
+        items=[(axis, axis.upper(), f"Across the scan's {axis} axis") for axis in ("x", "y", "z")],
+        default="z",
+    )
+    slice_at: FloatProperty(
+        name="Place",
+        description="Place of the slice: 0 is the scan's first voxel along the axis, 1 its last",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    density: EnumProperty(
+        name="Density colours",
+        description="Colours of the scan's cloud",
+        items=[(name, name.replace("_", "-").capitalize(), "Colours of the scan's cloud") for name in DENSITY_PRESETS],
+        default="hair",
+    )
+    region: EnumProperty(
+        name="Region",
+        description="Part of the scalp that is trimmed or grown anew",
+        items=[("all", "Whole scalp", "All hair")]
+        + [(name, label, f"Hair rooted at the {label.lower()}") for name, label in REGIONS.items()],
+    )
+    trim_length: FloatProperty(
+        name="Length (mm)",
+        description="Longer hair is cut to this length from its root. Unit: mm",
+        default=150.0,
+        min=1.0,
+        soft_max=600.0,
+        max=3000.0,
+        precision=0,
+    )
+    regrow_seed: IntProperty(name="Seed", description="Another seed grows other strands", default=1, min=0)
+
+
+def simulation_settings_of(group) -> SimulationSettings:
+    """The SimulationSettings that a scene's property group holds (`scene.ct2hair.simulation`)."""
+    values = {}
+    for known in fields(SimulationSettings):
+        value = getattr(group, known.name)
+        values[known.name] = _shortest(value) if known.type == "float" else value
+    return SimulationSettings().changed(values)
 
 
 def settings_of(group) -> Settings:
@@ -154,7 +212,7 @@ def _shortest(value: float) -> float:
     return value
 
 
-CLASSES = (*STAGES.values(), CT2HAIR_PG_settings, CT2HAIR_PG_scene)
+CLASSES = (*STAGES.values(), CT2HAIR_PG_settings, CT2HAIR_PG_simulation, CT2HAIR_PG_scene)
 
 
 def register() -> None:

@@ -1,23 +1,39 @@
-"""Operators for the job: reconstruct in the background, cancel, load a result."""
+"""Operators for the job: reconstruct in the background, wait in line, resume, cancel, load a result."""
 
 import time
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import Cancelled, CT2HairError
+from ..ct2hair_addon.jobs import JobFolder
 from ..ct2hair_addon.scene import HAIR_COLOURS
-from .properties import settings_of
-from .running import current, headless, redraw, time_left
+from ..ct2hair_addon.settings import STOPS
+from .preferences import chosen_cache, preferences, with_machine, worker_options
+from .properties import set_settings, settings_of
+from .running import Request, current, headless, redraw, time_left
 
+LINE = 8
+"""Jobs that may wait."""
+STAGE_NAMES = {
+    "scan": "Scan",
+    "head": "Head",
+    "orientation": "Orientation",
+    "guides": "Guides",
+    "dense": "Dense hair",
+    "refinement": "Refinement",
+    "result": "Result",
+}
+"""The pipeline's stages, as the panel calls them."""
 INTERVAL = 0.15
 """Seconds between two looks at the worker's messages."""
 
 
 class CT2HAIR_OT_reconstruct(bpy.types.Operator):
-    """Reconstruct the hair of the scan in a background process; the result arrives as a new collection"""
+    """Reconstruct the hair of the scan in a background process; the result arrives as a new collection. While one job runs,
+    the next waits in line"""
 
     bl_idname = "ct2hair.reconstruct"
     bl_label = "Reconstruct Hair"
@@ -32,13 +48,26 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )
+    until: EnumProperty(
+        name="Until",
+        description="The stage to stop after, to look at what there is; the next start goes on from there",
+        items=[("result", "Result", "All stages")] + [(stage, STAGE_NAMES[stage], "Stop after this stage") for stage in STOPS],
+        default="result",
+        options={"SKIP_SAVE"},
+    )
 
     _timer = None
 
     @classmethod
+    def description(cls, context, properties):
+        if properties.until == "result":
+            return cls.__doc__
+        return f"Run all stages up to '{STAGE_NAMES[properties.until]}', show what there is, and go on from there next time"
+
+    @classmethod
     def poll(cls, context):
-        if current.job is not None:
-            cls.poll_message_set("A reconstruction is running: wait for it, or cancel it")
+        if len(current.waiting) >= LINE:
+            cls.poll_message_set(f"A job runs and {LINE} wait in line: wait for one of them, or cancel it")
             return False
         return True
 
@@ -48,17 +77,22 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
         if not scan:
             self.report({"ERROR"}, "No scan is chosen: import one, or set its path in the panel")
             return {"CANCELLED"}
-        self._scan = Path(bpy.path.abspath(scan))
+        path = Path(bpy.path.abspath(scan))
         chosen = self.folder or properties.folder
-        self._folder = Path(bpy.path.abspath(chosen)) if chosen else scene.default_folder(self._scan)
-        self._colour = properties.colour
+        folder = Path(bpy.path.abspath(chosen)) if chosen else job_folder(path, context)
         try:
-            job = scene.start_job(self._scan, self._folder, settings_of(properties.settings), head=properties.head)
+            if current.job is not None:
+                _check_line(folder)
+                current.waiting.append(_request(context, path, folder, self.until))
+                self.report({"INFO"}, f"{path.name} waits in line: it starts when the running job is through")
+                redraw()
+                return {"FINISHED"}
+            _start(_request(context, path, folder, self.until))
         except (CT2HairError, OSError) as error:
-            current.end(str(error), failed=True)
+            if current.job is None:
+                current.end(str(error), failed=True)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        current.begin(job, self._folder)
         if headless():
             return self._wait(context)
         self._timer = context.window_manager.event_timer_add(INTERVAL, window=context.window)
@@ -75,17 +109,28 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if job.poll():
+            current.heard()
             context.workspace.status_text_set(
                 f"CT2Hair: {job.text} {job.fraction:.0%} {time_left(job.remaining)}   ESC: cancel"
             )
             redraw()
         if job.running:
             return {"PASS_THROUGH"}
-        return self._leave(context, self._finish(context))
+        outcome = self._finish(context)
+        while current.waiting:
+            try:
+                _start(current.waiting.pop(0))
+            except (CT2HairError, OSError) as error:
+                current.end(str(error), failed=True)
+                self.report({"ERROR"}, str(error))
+                continue
+            redraw()
+            return {"PASS_THROUGH"}
+        return self._leave(context, outcome)
 
     def cancel(self, context):
         """Blender ends the operator: the file or the window closes, and the worker goes with it."""
-        current.end("ended with the file; start again to go on from the last finished stage", failed=False)
+        current.end_all("ended with the file; start again to go on from the last finished stage")
         self._leave(context, {"CANCELLED"})
 
     def _wait(self, context):
@@ -95,6 +140,7 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
         try:
             while job.running:
                 for message in job.poll():
+                    current.heard()
                     if message.kind == "status":
                         print(f"CT2Hair: {job.text}")
                 if int(10 * job.fraction) > told:
@@ -108,11 +154,16 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
 
     def _finish(self, context):
         """Load what the job made, or say why there is nothing; the scene is untouched then."""
-        job = current.job
+        job, request = current.job, current.request
         job.poll()
         try:
             scene.check_job(job)
-            result = scene.load_result(self._folder, colour=self._colour, context=context)
+            if request.until is None:
+                result = scene.load_result(request.folder, colour=request.colour, context=context)
+                said = f"Reconstructed {len(result.hair.data.curves)} strands: '{result.collection.name}'"
+            else:
+                collection = scene.load_stage(request.folder, colour=request.colour, context=context)
+                said = f"'{collection.name}' shows the stage {STAGE_NAMES[request.until]}: look at it, then go on"
         except Cancelled as stopped:
             current.end(str(stopped), failed=False)
             self.report({"WARNING"}, f"Reconstruction {stopped}")
@@ -121,12 +172,12 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
             current.end(str(error), failed=True)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        _hide_scan(self._scan, context)
+        _hide_scan(request.scan, context)
         for warning in job.warnings:
             self.report({"WARNING"}, warning)
-        count = len(result.hair.data.curves)
-        current.end(f"{count} strands in '{result.collection.name}'", failed=False)
-        self.report({"INFO"}, f"Reconstructed {count} strands: '{result.collection.name}'")
+        _forget_unfinished(request)
+        current.end(said, failed=False)
+        self.report({"INFO"}, said)
         return {"FINISHED"}
 
     def _leave(self, context, outcome):
@@ -137,6 +188,138 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
             context.workspace.status_text_set(None)
         redraw()
         return outcome
+
+
+def job_folder(scan: Path, context) -> Path:
+    """Where a job for `scan` goes unless the scene names a folder: beside the .blend, or into the cache folder."""
+    known = preferences(context)
+    if known is None or (known.beside_blend and bpy.data.filepath):
+        return scene.default_folder(scan)
+    return chosen_cache(known) / "jobs" / scene.scan_name(scan)
+
+
+def _check_line(folder: Path) -> None:
+    """Refuse a folder that the running job or a waiting one writes to."""
+    taken = [current.folder, *(request.folder for request in current.waiting)]
+    if folder.resolve() in [other.resolve() for other in taken if other is not None]:
+        raise CT2HairError(f"a job for {folder} is running or waits already; choose another folder in the panel")
+
+
+def _request(context, scan: Path, folder: Path, until: str) -> Request:
+    """All that the job needs of the scene as it is now. Raises CT2HairError for what would fail at once."""
+    properties, known = context.scene.ct2hair, preferences()
+    if not scan.exists():
+        raise CT2HairError(f"{scan}: there is no such file; choose the scan again")
+    settings = with_machine(settings_of(properties.settings), known)
+    if properties.head is not None:
+        template = scene.save_head(properties.head, folder / "template.obj", local=bool(settings.head.place))
+        settings = settings.changed({"head.mesh": str(template.resolve())})
+    stop = None if until == "result" else until
+    return Request(scan, folder, settings, properties.colour, stop, context.scene.name, worker_options(known))
+
+
+def _start(request: Request) -> None:
+    """Start a job, and note in its scene that it is under way: a file that is saved now offers to resume it."""
+    job = scene.start_job(request.scan, request.folder, request.settings, until=request.until, **request.options)
+    current.begin(job, request.folder, request)
+    owner = bpy.data.scenes.get(request.scene)
+    if owner is not None:
+        owner.ct2hair.unfinished = str(request.folder.resolve())
+
+
+def _forget_unfinished(request: Request) -> None:
+    owner = bpy.data.scenes.get(request.scene)
+    if owner is not None and owner.ct2hair.unfinished == str(request.folder.resolve()):
+        owner.ct2hair.unfinished = ""
+
+
+class CT2HAIR_OT_resume(bpy.types.Operator):
+    """Go on with the job that this file was saved in the middle of, from its last finished stage"""
+
+    bl_idname = "ct2hair.resume"
+    bl_label = "Resume Job"
+    bl_options = {"UNDO"}
+
+    discard: BoolProperty(
+        name="Forget it", description="Don't go on; the finished stages stay in the job's folder", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if not context.scene.ct2hair.unfinished:
+            cls.poll_message_set("This file has no unfinished job")
+            return False
+        if current.job is not None:
+            cls.poll_message_set("A job is running: wait for it, or cancel it")
+            return False
+        return True
+
+    def execute(self, context):
+        properties = context.scene.ct2hair
+        if self.discard:
+            properties.unfinished = ""
+            return {"FINISHED"}
+        try:
+            scan, out, settings, _, _, until = JobFolder(Path(properties.unfinished) / "job").read()
+        except CT2HairError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        properties.scan, properties.folder = str(scan), str(out)
+        set_settings(properties.settings, settings)
+        return bpy.ops.ct2hair.reconstruct("EXEC_DEFAULT" if headless() else "INVOKE_DEFAULT", until=until or "result")
+
+
+class CT2HAIR_OT_unqueue(bpy.types.Operator):
+    """Take a waiting job out of the line"""
+
+    bl_idname = "ct2hair.unqueue"
+    bl_label = "Remove from Line"
+
+    index: IntProperty(name="Place", description="Place in the line, from 0", min=0)
+
+    @classmethod
+    def poll(cls, context):
+        if not current.waiting:
+            cls.poll_message_set("No job waits in line")
+            return False
+        return True
+
+    def execute(self, context):
+        if self.index >= len(current.waiting):
+            self.report({"ERROR"}, f"Only {len(current.waiting)} jobs wait in line")
+            return {"CANCELLED"}
+        gone = current.waiting.pop(self.index)
+        self.report({"INFO"}, f"{gone.scan.name} is out of the line")
+        redraw()
+        return {"FINISHED"}
+
+
+@bpy.app.handlers.persistent
+def _before_loading(*_) -> None:
+    """Another file is about to open: the worker ends with this one."""
+    if current.job is not None or current.waiting:
+        current.end_all("ended with the file; open it again to go on from the last finished stage")
+
+
+@bpy.app.handlers.persistent
+def _after_loading(*_) -> None:
+    """Tell of a job that the file was saved in the middle of; the panel offers to resume it."""
+    for owner in bpy.data.scenes:
+        if owner.ct2hair.unfinished:
+            print(f"CT2Hair: '{owner.name}' has an unfinished job in {owner.ct2hair.unfinished}; the sidebar can resume it")
+            if not headless():
+                bpy.app.timers.register(_offer_to_resume, first_interval=1.0)
+
+
+def _offer_to_resume() -> None:
+    def draw(self, context):
+        self.layout.operator_context = "INVOKE_DEFAULT"
+        self.layout.label(text=bpy.context.scene.ct2hair.unfinished)
+        self.layout.operator("ct2hair.resume", icon="PLAY")
+        self.layout.operator("ct2hair.resume", text="Forget It", icon="X").discard = True
+
+    if bpy.context.window is not None and bpy.context.scene.ct2hair.unfinished:
+        bpy.context.window_manager.popup_menu(draw, title="CT2Hair: this file has an unfinished job", icon="SORTTIME")
 
 
 class CT2HAIR_OT_cancel(bpy.types.Operator):
@@ -207,16 +390,21 @@ def _hide_scan(path: Path, context) -> None:
                     ob.hide_set(True, view_layer=context.view_layer)
 
 
-CLASSES = (CT2HAIR_OT_reconstruct, CT2HAIR_OT_cancel, CT2HAIR_OT_load_result)
+CLASSES = (CT2HAIR_OT_reconstruct, CT2HAIR_OT_resume, CT2HAIR_OT_unqueue, CT2HAIR_OT_cancel, CT2HAIR_OT_load_result)
+_HANDLERS = ((bpy.app.handlers.load_pre, _before_loading), (bpy.app.handlers.load_post, _after_loading))
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
+    for handlers, handler in _HANDLERS:
+        handlers.append(handler)
 
 
 def unregister() -> None:
     if current.job is not None:
-        current.end("ended: the extension was switched off", failed=False)
+        current.end_all("ended: the extension was switched off")
+    for handlers, handler in _HANDLERS:
+        handlers.remove(handler)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from ct2hair_addon import cli
-from ct2hair_addon.settings import parameters
+from ct2hair_addon.cli import main
+from ct2hair_addon.errors import CT2HairError
+from ct2hair_addon.settings import Settings, parameters
 from ct2hair_addon.strand_files import read_strands, write_strands
 from ct2hair_addon.strands import Strands
 
@@ -73,3 +75,67 @@ def test_a_settings_file_is_laid_over_the_preset(tmp_path):
     path.write_text("[1]")
     with pytest.raises(cli.CT2HairError, match="not a file of settings"):
         cli._settings_file(path)
+
+
+@pytest.fixture
+def scans(tmp_path, monkeypatch):
+    """A folder of three files that pass for scans, and a pipeline that takes all but one of them."""
+    from types import SimpleNamespace
+
+    from ct2hair_addon import pipeline
+
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name in ("a.npy", "b.nii.gz", "c.tif", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    seen = []
+
+    def reconstruct(scan, out, settings, *, observer):
+        seen.append((scan.name, out, settings))
+        if scan.name == "b.nii.gz":
+            raise CT2HairError("b shows no hair")
+        if scan.name == "boom.npy":
+            raise ZeroDivisionError("our fault")
+        return SimpleNamespace(hair=[0] * 7)
+
+    monkeypatch.setattr(pipeline, "reconstruct", reconstruct)
+    return SimpleNamespace(folder=folder, seen=seen)
+
+
+def test_a_batch_goes_on_after_a_failure_and_sums_up(scans, tmp_path, capsys):
+    assert main(["batch", str(scans.folder), "--out", str(tmp_path / "out"), "--preset", "draft"]) == 1
+    assert [name for name, *_ in scans.seen] == ["a.npy", "b.nii.gz", "c.tif"]
+    assert [out.name for _, out, _ in scans.seen] == ["a", "b", "c"]
+    assert all(settings == Settings.preset("draft") for *_, settings in scans.seen)
+    told = capsys.readouterr().out
+    assert "b: b shows no hair" in told and "2 of 3 done" in told
+    summary = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert [entry["state"] for entry in summary] == ["done", "failed", "done"] and summary[0]["strands"] == 7
+
+
+def test_a_batch_file_names_scans_presets_and_settings(scans, tmp_path):
+    (scans.folder / "boom.npy").write_bytes(b"x")
+    entries = [
+        {"scan": "a.npy", "name": "first", "preset": "final", "settings": {"guides": {"step": 0.5}}},
+        {"scan": "a.npy", "name": "first"},
+        {"scan": "boom.npy"},
+        {"scan": "c.tif", "settings": {"guides": {"stride": 1}}},
+    ]
+    path = scans.folder / "jobs.json"
+    path.write_text(json.dumps(entries))
+    assert main(["batch", str(path), "--out", str(tmp_path / "out")]) == 1
+    assert [out.name for _, out, _ in scans.seen] == ["first", "first_1", "boom"]
+    assert scans.seen[0][2] == Settings.preset("final").changed({"guides.step": 0.5})
+    errors = [entry["error"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text())]
+    assert errors[:2] == ["", ""] and "ZeroDivisionError" in errors[2] and "guides.stride" in errors[3]
+    path.write_text(json.dumps(entries[:1]))
+    assert main(["batch", str(path), "--out", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("{", "not JSON"), ('{"scan": "a"}', "expected a list"), ("[]", "there is no scan")]
+)
+def test_a_batch_of_nothing_is_refused(tmp_path, capsys, text, message):
+    (tmp_path / "jobs.json").write_text(text)
+    assert main(["batch", str(tmp_path / "jobs.json"), "--out", str(tmp_path / "out")]) == 1
+    assert message in capsys.readouterr().err

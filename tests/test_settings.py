@@ -49,3 +49,12 @@ def test_malformed_json_is_refused():
 def test_unknown_preset_names_the_known_ones():
     with pytest.raises(SettingsError, match="draft, standard, final, paper"):
         Settings.preset("fast")
+
+
+def test_the_manual_lists_the_parameters_as_they_are():
+    import runpy
+    from pathlib import Path
+
+    script = Path(__file__).resolve().parents[1] / "docs" / "settings_table.py"
+    page = runpy.run_path(str(script))
+    assert page["PAGE"].read_text(encoding="utf-8") == page["table"](), "run `make manual`"

@@ -207,7 +207,8 @@ def _as_rigid_as_possible(positions, faces, flat):
 
 def _oriented(positions, faces, flat):
     """The flattening turned so that v follows the front (-y), by the rotation that fits best over all triangles."""
-    cross = np.cross(flat[faces[:, 1]] - flat[faces[:, 0]], flat[faces[:, 2]] - flat[faces[:, 0]])
+    one, two = flat[faces[:, 1]] - flat[faces[:, 0]], flat[faces[:, 2]] - flat[faces[:, 0]]
+    cross = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
     if cross.sum() < 0:
         flat = flat * [-1.0, 1.0]
     middle = flat - flat.mean(axis=0)

@@ -143,12 +143,14 @@ def register_head(
 
     knots: (K, 3) points of knots and hairnet, scan frame, mm; up to 40 % may be something else. solid_points: (S, 3) on the
     mannequin's surface, may be empty. density, hair_level: the hair, which falls down and leaves the face free.
-    Raises HeadError where there are too few points, or they lie on no head.
+    Where `settings.place` says where the head stands, it is only refined. Raises HeadError where there are too few points,
+    or they lie on no head.
     """
     solid = np.asarray(solid_points, np.float64).reshape(-1, 3)
     hair, mass = _hair_mass(density, hair_level)
     candidates = orientations(settings.face, settings.up)
-    return _registered(template, np.asarray(knots, np.float64).reshape(-1, 3), solid, hair, mass, candidates, False, progress)
+    knots, start = np.asarray(knots, np.float64).reshape(-1, 3), placed_by_hand(settings.place)
+    return _registered(template, knots, solid, hair, mass, candidates, False, progress, start)
 
 
 def fit_to_roots(
@@ -160,7 +162,21 @@ def fit_to_roots(
     return _registered(template, roots, nothing, nothing, np.zeros(0), orientations(face, up), True, progress)
 
 
-def _registered(template, knots, solid_points, hair, mass, candidates, only_roots, progress):
+def placed_by_hand(text: str) -> np.ndarray | None:
+    """The (4, 4) matrix of `HeadSettings.place`, None where it is empty. Raises HeadError for what is no similarity."""
+    if not text.strip():
+        return None
+    try:
+        matrix = np.array([float(word) for word in text.replace(",", " ").split()]).reshape(4, 4)
+    except ValueError:
+        raise HeadError("head.place must be the 16 numbers of a matrix, or empty; place the head again") from None
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if not 0.2 < scale < 5.0 or not np.allclose(matrix[:3, :3].T @ matrix[:3, :3] / scale**2, np.eye(3), atol=1e-3):
+        raise HeadError("head.place must be a rotation, a shift and one scale of 0.2 to 5; place the head again")
+    return matrix
+
+
+def _registered(template, knots, solid_points, hair, mass, candidates, only_roots, progress, start=None):
     finite = np.isfinite(knots).all(axis=1)
     knots = knots[finite]
     if len(knots) < LEAST_POINTS:
@@ -176,7 +192,9 @@ def _registered(template, knots, solid_points, hair, mass, candidates, only_root
     solid = _thinned(solid_points)
     head = Head(template)
     progress(0.05, 1)
-    matrix, certainty, (face, up), warnings = _pose(head, scalp_cloud, solid, hair, mass, candidates, part(progress, 0.05, 0.4))
+    matrix, certainty, (face, up), warnings = _pose(
+        head, scalp_cloud, solid, hair, mass, candidates, part(progress, 0.05, 0.4), start
+    )
     vertices = _fitted(head, matrix, scalp_cloud, solid, only_roots, part(progress, 0.4, 0.9))
     mesh, grown = _with_grown_scalp(template, vertices, matrix, scalp_cloud)
     mesh = mesh.transformed(matrix)
@@ -226,8 +244,8 @@ def _hair_mass(density, hair_level):
     return centres[count > 0], count[count > 0].astype(np.float64)
 
 
-def _pose(head, knots, solid, hair, mass, candidates, progress):
-    """The best similarity head -> scan over the candidates: (matrix, certainty, (face, up), warnings)."""
+def _pose(head, knots, solid, hair, mass, candidates, progress, placed=None):
+    """The best similarity head -> scan over the candidates, or from `placed`: (matrix, certainty, (face, up), warnings)."""
     template = head.sample_scalp(SEARCH_POINTS // 2, 0)
     template_centre, template_radius, _ = scalp_sphere(template.position, np.ones(len(template)))
     centre, radius, _ = scalp_sphere(knots.points, knots.weights)
@@ -237,10 +255,15 @@ def _pose(head, knots, solid, hair, mass, candidates, progress):
     solid_tree = cKDTree(few_solid.points) if len(few_solid) else None
     outer = _outer_samples(head.mesh)
     tried = []
+    if placed is not None:
+        turn = placed[:3, :3] / np.cbrt(np.linalg.det(placed[:3, :3]))
+        candidates = [max(orientations(), key=lambda pair: np.trace(axis_rotation(*pair).T @ turn))]
     for number, (face, up) in enumerate(candidates):
         matrix = np.eye(4)
         matrix[:3, :3] = axis_rotation(face, up) * scale
         matrix[:3, 3] = centre - matrix[:3, :3] @ template_centre
+        if placed is not None:
+            matrix = placed
         start = matrix
         for reach in SEARCH_REACHES:
             matrix = _icp_step(head, template, matrix, few, tree, few_solid, reach)

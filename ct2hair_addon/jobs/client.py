@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..cache import cache_folder
 from ..settings import Settings
 from .folder import JobFolder
 from .messages import ERROR, PROGRESS, RESULT, STATUS, WARNING, Message
@@ -134,13 +136,16 @@ def start(
     raw_type: str | None = None,
     python: str | None = None,
     paths: Iterable[str] = (),
+    environment: Mapping[str, str] | None = None,
+    until: str | None = None,
 ) -> Job:
     """Start the reconstruction of `scan` into `out` in a background process.
 
     python: the interpreter of the worker, this one by default. paths: folders that it needs on `sys.path` beside the
     extension's root and this interpreter's own site-packages (where the wheels of Blender's extensions lie, say).
+    environment: variables for it (see `worker.LOG_LEVEL`, `cache.cache_folder`). until: the stage to stop after, or None.
     """
-    folder = JobFolder.create(Path(scan), Path(out), settings, raw_shape, raw_type)
+    folder = JobFolder.create(Path(scan), Path(out), settings, raw_shape, raw_type, until)
     with folder.log.open("a", encoding="utf-8") as log:
         process = subprocess.Popen(
             [python or sys.executable, "-m", "ct2hair_addon.jobs.worker", str(folder.path)],
@@ -149,16 +154,81 @@ def start(
             stderr=log,
             text=True,
             encoding="utf-8",
-            env=_environment(paths, own=python is None),
+            env=_environment(paths, own=python is None, more=environment),
             cwd=ROOT,
         )
     return Job(folder, process)
 
 
-def _environment(paths: Iterable[str], own: bool) -> dict[str, str]:
+def start_command(
+    arguments: Iterable[str], log: Path, *, python: str | None = None, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen:
+    """Start a command of the command line (`["inspect", SCAN, ...]`) in the background; what it prints goes to `log`."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as file:
+        return subprocess.Popen(
+            [python or sys.executable, "-m", "ct2hair_addon", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=_environment((), own=python is None, more=environment),
+            cwd=ROOT,
+        )
+
+
+@dataclass(frozen=True)
+class PythonFound:
+    """What `check_python` found: version, device ("cpu" or a card's name), and the modules that are missing."""
+
+    version: str = ""
+    device: str = ""
+    missing: tuple[str, ...] = ()
+    problem: str = ""
+
+    @property
+    def usable(self) -> bool:
+        return not self.problem and not self.missing
+
+
+NEEDED = ("numpy", "scipy", "numba", "skimage", "torch", "openvdb")
+
+
+def check_python(python: str | None = None, timeout: float = 120.0) -> PythonFound:
+    """Ask a Python whether it can run the worker: its version, what the engine needs of it, its CUDA card. Takes seconds."""
+    script = (
+        "import importlib, json, platform\n"
+        "missing = []\n"
+        f"for name in {NEEDED!r}:\n"
+        "    try: importlib.import_module(name)\n"
+        "    except Exception: missing.append(name)\n"
+        "device = 'cpu'\n"
+        "if 'torch' not in missing:\n"
+        "    import torch\n"
+        "    device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'cpu'\n"
+        "print(json.dumps([platform.python_version(), device, missing]))\n"
+    )
+    command = [python or sys.executable, "-c", script]
+    try:
+        run = subprocess.run(
+            command, capture_output=True, text=True, timeout=timeout, check=False, env=_environment((), own=python is None)
+        )
+        version, device, missing = json.loads(run.stdout.strip().splitlines()[-1])
+    except FileNotFoundError:
+        return PythonFound(problem=f"{python}: there is no such program")
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return PythonFound(problem=f"{command[0]}: can't be run ({error})")
+    except (IndexError, ValueError):
+        return PythonFound(problem=f"{command[0]}: does not answer as a Python does: {run.stderr.strip()[-200:]}")
+    return PythonFound(version, device, tuple(missing))
+
+
+def _environment(paths: Iterable[str], own: bool, more: Mapping[str, str] | None = None) -> dict[str, str]:
     """The worker's environment. Another Python gets the engine alone: our site-packages would be of the wrong version."""
     inherited = [entry for entry in sys.path if entry.rstrip("/\\").endswith("site-packages")] if own else []
     folders = dict.fromkeys([str(ROOT), *map(str, paths), *inherited])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), PARENT: str(os.getpid())}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), PARENT: str(os.getpid()), **(more or {})}
     environment.pop("PYTHONHOME", None)
+    kernels = environment.get("NUMBA_CACHE_DIR", "")
+    if kernels.startswith(str(cache_folder() / "kernels")):
+        del environment["NUMBA_CACHE_DIR"]  # ours, for the name that we are loaded by; the worker is loaded by another
     return environment

@@ -25,7 +25,7 @@ class JobFolder:
         return self.path / "log.txt"
 
     @classmethod
-    def create(cls, scan: Path, out: Path, settings: Settings, raw_shape=None, raw_type=None) -> JobFolder:
+    def create(cls, scan: Path, out: Path, settings: Settings, raw_shape=None, raw_type=None, until=None) -> JobFolder:
         """Describe a job in `<out>/job`, written aside and renamed."""
         folder = cls(Path(out) / "job")
         folder.path.mkdir(parents=True, exist_ok=True)
@@ -34,6 +34,7 @@ class JobFolder:
             "out": str(Path(out).resolve()),
             "raw_shape": None if raw_shape is None else [int(n) for n in raw_shape],
             "raw_type": raw_type,
+            "until": until,
             "settings": settings.to_dict(),
         }
         beside = folder.path / ".job.json.part"
@@ -41,8 +42,8 @@ class JobFolder:
         beside.replace(folder.description)
         return folder
 
-    def read(self) -> tuple[Path, Path, Settings, tuple[int, ...] | None, str | None]:
-        """(scan, out, settings, shape and type of a raw scan). Raises CT2HairError where job.json is missing or damaged."""
+    def read(self) -> tuple[Path, Path, Settings, tuple[int, ...] | None, str | None, str | None]:
+        """(scan, out, settings, shape and type of a raw scan, stage to stop after). CT2HairError where job.json is bad."""
         try:
             values = json.loads(self.description.read_text())
             shape = values["raw_shape"]
@@ -52,6 +53,7 @@ class JobFolder:
                 Settings.from_dict(values["settings"]),
                 None if shape is None else tuple(shape),
                 values["raw_type"],
+                values.get("until"),
             )
         except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
             raise CT2HairError(f"{self.description}: not a job description ({error}); start the job again") from error

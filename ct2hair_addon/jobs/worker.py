@@ -17,10 +17,12 @@ from pathlib import Path
 
 from ..errors import Cancelled, CT2HairError
 from .folder import JobFolder
-from .messages import ERROR, PROGRESS, RESULT, STATUS, WARNING, Message
+from .messages import ERROR, KINDS, PROGRESS, RESULT, STATUS, WARNING, Message
 
 PARENT = "CT2HAIR_PARENT"
 """Environment variable with the process id of the starter: where it is set, the worker ends when its standard input does."""
+LOG_LEVEL = "CT2HAIR_LOG_LEVEL"
+"""Environment variable: `quiet` logs warnings and errors alone, `verbose` every progress message as well."""
 DONE, FAILED, CRASHED, STOPPED = 0, 1, 3, 130
 """Exit codes: done, refused with a clear error, an unforeseen error, cancelled."""
 
@@ -40,10 +42,13 @@ def main(job: str) -> int:
 
         if stopped.is_set():
             raise Cancelled
-        scan, out, settings, raw_shape, raw_type = folder.read()
+        scan, out, settings, raw_shape, raw_type, until = folder.read()
         observer = _Speaker(say, stopped)
-        result = pipeline.reconstruct(scan, out, settings, raw_shape=raw_shape, raw_type=raw_type, observer=observer)
-        say(Message(RESULT, {"out": str(out), "strands": len(result.hair), "seconds": result.seconds}))
+        result = pipeline.reconstruct(
+            scan, out, settings, raw_shape=raw_shape, raw_type=raw_type, observer=observer, until=until
+        )
+        told = {"strands": 0, "seconds": 0.0} if result is None else {"strands": len(result.hair), "seconds": result.seconds}
+        say(Message(RESULT, {"out": str(out), "until": until, **told}))
         return DONE
     except Cancelled:
         say(Message(ERROR, {"text": "cancelled; the finished stages are kept", "log": str(folder.log), "cancelled": True}))
@@ -70,9 +75,11 @@ def _protect_stdout(folder: JobFolder) -> Callable[[Message], None]:
     sys.stdout = sys.stderr = log
     print(time.strftime("--- %Y-%m-%d %H:%M:%S"), " ".join(sys.argv), "process", os.getpid())
     lock = threading.Lock()
+    level = os.environ.get(LOG_LEVEL, "normal")
+    logged = {"quiet": (WARNING, ERROR), "verbose": KINDS}.get(level, (STATUS, WARNING, ERROR, RESULT))
 
     def say(message: Message) -> None:
-        if message.kind != PROGRESS:
+        if message.kind in logged:
             print(message.to_line(), end="")
         with lock:
             try:

@@ -37,6 +37,8 @@ FOLLOW_GROUP = "CT2Hair Follow Head"
 WIDTH_INPUT = "Width"
 """Input of the modifier that all widths are multiplied by: 1 is true to life, see `set_width_factor`."""
 
+INTERNAL = "ct2hair_"
+"""Attributes of such names serve the scene's modifiers and are no part of the strands."""
 _ATTACHED = "surface_uv_coordinate"
 _CURVE_ATTRIBUTES = {"FLOAT": (), "INT": (), "FLOAT2": (2,), "FLOAT_VECTOR": (3,)}
 
@@ -138,7 +140,7 @@ def strands_of(ob: bpy.types.Object, evaluated: bool = False) -> Strands:
     curves.curve_offset_data.foreach_get("value", offsets)
     strand, point = {}, {}
     for attribute in curves.attributes:
-        if attribute.name in ("position", "curve_type", "resolution") or attribute.name.startswith("."):
+        if attribute.name in ("position", "curve_type", "resolution") or attribute.name.startswith((".", INTERNAL)):
             continue
         values = read_attribute(curves, attribute.name)
         if values is not None:

@@ -75,12 +75,14 @@ def head_mesh(ob: bpy.types.Object, evaluated: bool = False) -> HeadMesh:
             source.to_mesh_clear()
 
 
-def save_head(ob: bpy.types.Object, path: str | Path) -> Path:
+def save_head(ob: bpy.types.Object, path: str | Path, local: bool = False) -> Path:
     """Write the user's head object, as the scene shows it, to an OBJ that the engine takes as its template (`head.mesh`).
 
-    The head must stand as the head frame wants it: real size, upright, face to -y. Raises HeadError as `head_mesh` does.
+    The head must stand as the head frame wants it: real size, upright, face to -y; with `local` as it is before the object
+    was moved, for a head that `placement` says the place of. Raises HeadError as `head_mesh` does.
     """
-    shown = np.diag([1 / MM, 1 / MM, 1 / MM, 1.0]) @ np.array(ob.matrix_world) @ np.diag([MM, MM, MM, 1.0])
+    world = np.eye(4) if local else np.array(ob.matrix_world)
+    shown = np.diag([1 / MM, 1 / MM, 1 / MM, 1.0]) @ world @ np.diag([MM, MM, MM, 1.0])
     mesh = head_mesh(ob, evaluated=True).transformed(shown)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ Every function builds its data first and links it last: where one fails, the sce
 from __future__ import annotations
 
 import json
+import subprocess
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,14 +26,15 @@ from mathutils import Matrix
 from .. import __version__, jobs
 from ..cache import cache_folder
 from ..errors import Cancelled, CT2HairError, ScanError
-from ..head import HeadMesh, load_obj
+from ..head import Head, HeadMesh, fit_to_roots, load_obj, template_head, unwrap
 from ..progress import Progress, silent
 from ..settings import Settings
+from ..strand_files import read_strands
 from ..strands import Strands
-from .export import write_alembic, write_blend, write_usd
-from .frames import head_from_scan, scene_from_scan, scene_from_unregistered_scan
+from .export import write_alembic, write_blend, write_strand_file, write_usd
+from .frames import MM, head_from_scan, rigid, scene_from_scan, scene_from_unregistered_scan
 from .hair import DIAMETER, new_hair
-from .head import attach, new_head, save_head
+from .head import attach, head_mesh, new_head, save_head
 from .materials import guide_material, hair_material
 from .picture import render_picture
 from .results import KIND, ROLE, HairResult, ScanResult
@@ -217,18 +219,135 @@ def start_job(
     *,
     head: bpy.types.Object | None = None,
     python: str | None = None,
+    environment: Mapping[str, str] | None = None,
+    until: str | None = None,
 ) -> jobs.Job:
     """Start the reconstruction of `scan` into `folder` in a background process that Blender's own modules are known to.
 
     head: a mesh object of the user's, with a vertex group 'scalp', in place of the built-in mannequin. python: another
-    interpreter for the worker. Raises ScanError or HeadError before anything is started.
+    interpreter for the worker. environment: variables for it. until: the stage to stop after (`STOPS`). Raises ScanError or
+    HeadError before anything is started.
     """
     if not Path(scan).exists():
         raise ScanError(f"{scan}: there is no such file; choose the scan again")
     if head is not None:
         settings = settings.changed({"head.mesh": str(save_head(head, Path(folder) / "template.obj").resolve())})
     _expose_bundled_modules()
-    return jobs.start(scan, folder, settings, python=python)
+    return jobs.start(scan, folder, settings, python=python, environment=environment, until=until)
+
+
+def start_inspection(
+    scan: str | Path,
+    folder: str | Path,
+    settings: Settings,
+    *,
+    python: str | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.Popen:
+    """Start looking at `scan` in the background; `folder`/inspection.npz is there when the process ends with 0.
+
+    What it says, an error too, is in `folder`/inspection.txt. Raises ScanError where there is no such scan.
+    """
+    if not Path(scan).exists():
+        raise ScanError(f"{scan}: there is no such file; choose the scan again")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    chosen = folder / "inspection.json"
+    chosen.write_text(json.dumps({"scan": settings.to_dict()["scan"]}))
+    _expose_bundled_modules()
+    arguments = ["inspect", str(Path(scan).resolve()), "--out", str((folder / "inspection.npz").resolve())]
+    arguments += ["--settings", str(chosen.resolve())]
+    return jobs.start_command(arguments, folder / "inspection.txt", python=python, environment=environment)
+
+
+def load_stage(folder: str | Path, *, colour: str = "brown", context: bpy.types.Context | None = None) -> bpy.types.Collection:
+    """Bring what a job has that was stopped after a stage: the wig, the head in it, guides or dense hair; a new collection.
+
+    Raises CT2HairError where there is nothing; the scene is then untouched.
+    """
+    folder = Path(folder)
+    path = folder / "stage.json"
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+        until, level = known["until"], known["scan"]["hair_level"]
+        name = f"{scan_name(known['scan']['file'])} {until}"
+        matrix = np.array(known["head"]["head_to_scan"], np.float64).reshape(4, 4) if known["head"] else None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CT2HairError(f"{path}: not the state of a job ({error}); run the stage again") from None
+    properties = {
+        "ct2hair_folder": str(folder.resolve()),
+        "ct2hair_report": json.dumps(known),
+        "ct2hair_settings": json.dumps(known["settings"], sort_keys=True),
+        "ct2hair_version": known["program"]["version"],
+    }
+    if matrix is None:
+        return _show_wig(folder / "volume.vdb", name, level, properties, context)
+    to_head = head_from_scan(matrix)
+    mesh = load_obj(folder / "head.obj").transformed(to_head)
+    if until == "head":
+        return _show_wig(folder / "volume.vdb", name, level, properties, context, mesh, matrix)
+    guides = Strands.load(folder / "guides.npz").transformed(to_head)
+    hair = Strands.load(folder / "dense.npz").transformed(to_head) if until == "dense" else guides
+    return show_strands(
+        hair,
+        mesh,
+        name,
+        guides=guides,
+        grid=folder / "volume.vdb",
+        head_to_scan=matrix,
+        hair_level=level,
+        colour=colour,
+        properties=properties,
+        context=context,
+    ).collection
+
+
+def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=None) -> bpy.types.Collection:
+    """The wig's volume, and the head in it where it is known, as a collection of the kind `scan`."""
+    summary = summarize(grid, level)
+    with NewData() as new:
+        collection, root = _new_collection(new, name, "scan")
+        scan = _new_empty(new, f"{name} Scan", "scan", root)
+        place = (
+            scene_from_unregistered_scan(summary.low_corner, summary.high_corner)
+            if head_to_scan is None
+            else scene_from_scan(head_to_scan)
+        )
+        scan.matrix_basis = Matrix(place.tolist())
+        collection.objects.link(scan)
+        _enrol(collection, new_volume(new, f"{name} Volume", grid, summary), "volume", scan)
+        if mesh is not None:
+            _enrol(collection, new_head(new, f"{name} Head", mesh), "head", root)
+        for key, value in properties.items():
+            collection[key] = value
+    _link(collection, context)
+    return collection
+
+
+def add_template_head(name: str = "CT2Hair Head", context: bpy.types.Context | None = None) -> bpy.types.Object:
+    """Add the built-in mannequin, its scalp marked and flattened, to the scene at the 3D cursor; returns the object."""
+    context = context or bpy.context
+    with NewData() as new:
+        ob = new_head(new, name, template_head())
+    ob.location = context.scene.cursor.location
+    (context.collection or context.scene.collection).objects.link(ob)
+    context.view_layer.update()
+    return ob
+
+
+def placement(scan: bpy.types.Object, head: bpy.types.Object) -> str:
+    """The setting `head.place` for a head that the user has put where it stands in a scan: 16 numbers, head to scan, mm.
+
+    scan: the empty of an imported scan (role `scan`). head: the template as it is, moved, turned and scaled evenly.
+    Raises CT2HairError where it is scaled unevenly or mirrored.
+    """
+    matrix = np.linalg.inv(np.array(scan.matrix_world, np.float64)) @ np.array(head.matrix_world, np.float64)
+    matrix = matrix @ np.diag([MM, MM, MM, 1.0])
+    try:
+        rigid(matrix)
+    except ValueError:
+        raise CT2HairError(f"'{head.name}' is scaled unevenly or mirrored: give it one scale for all axes") from None
+    return " ".join(f"{value:.9g}" for value in matrix.ravel())
 
 
 def reconstruct(
@@ -269,23 +388,31 @@ def check_job(job: jobs.Job) -> None:
         raise CT2HairError(f"{job.error or 'the worker ended without a result'} (log: {job.log_path})")
 
 
-FORMATS = ("blend", "alembic", "usd", "picture")
+STRAND_FORMATS = ("bin", "data", "hair", "npz")
+"""Strand files of other programs and our own; each is also its file's ending."""
+FORMATS = ("blend", "alembic", "usd", "picture", *STRAND_FORMATS)
+USUAL_FORMATS = ("blend", "alembic", "usd", "picture")
 
 
 def export_all(
     result: HairResult,
     folder: str | Path,
     *,
-    formats: tuple[str, ...] = FORMATS,
+    formats: tuple[str, ...] = USUAL_FORMATS,
     name: str = "hair",
     unit: str = "m",
+    up: str = "y",
+    strand_unit: str = "mm",
+    strand_up: str = "z",
+    frames: tuple[int, int] | None = None,
     samples: int = 64,
     size: int = 800,
 ) -> dict[str, Path]:
-    """Write a result into `folder`: <name>.blend, <name>.abc, <name>.usda, render.png; returns format -> path.
+    """Write a result into `folder`: <name>.blend, <name>.abc, <name>.usda, <name>.bin ..., render.png; format -> path.
 
-    The job's report.html and report.json come along where the folder is another one than the job's. unit: of Alembic, "m" or
-    "cm". samples, size: of the picture.
+    The job's report.html and report.json come along where the folder is another one than the job's. unit, up: of Alembic.
+    strand_unit, strand_up: of strand files. frames: (first, last) that Alembic and USD are animated over. samples, size: of
+    the picture.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -294,9 +421,12 @@ def export_all(
         raise CT2HairError(f"unknown format {', '.join(sorted(unknown))}; there are {', '.join(FORMATS)}")
     written = {}
     if "alembic" in formats:
-        written["alembic"] = write_alembic(result, folder / f"{name}.abc", unit)
+        written["alembic"] = write_alembic(result, folder / f"{name}.abc", unit, up, frames=frames)
     if "usd" in formats:
-        written["usd"] = write_usd(result, folder / f"{name}.usda")
+        written["usd"] = write_usd(result, folder / f"{name}.usda", frames=frames)
+    for ending in STRAND_FORMATS:
+        if ending in formats:
+            written[ending] = write_strand_file(result, folder / f"{name}.{ending}", strand_unit, strand_up)
     if "picture" in formats:
         written["picture"] = render_picture(result, folder / "render.png", samples=samples, size=size)
     if "blend" in formats:
@@ -307,6 +437,75 @@ def export_all(
             (folder / report).write_bytes(source.read_bytes())
             written[report] = folder / report
     return written
+
+
+STRAND_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+"""Units of strand files, in millimetres."""
+
+
+def import_strands(
+    path: str | Path,
+    *,
+    unit: str = "auto",
+    up: str = "z",
+    head: bpy.types.Object | None = None,
+    name: str | None = None,
+    colour: str = "brown",
+    diameter: float = DIAMETER,
+    context: bpy.types.Context | None = None,
+) -> HairResult:
+    """Bring strands of a file (.npz .bin .data .hair) into the scene, as hair on a head.
+
+    unit: mm, cm, m, or auto, which takes the one by which the hair is as large as hair is. up: z (face to -y), or y (face to
+    +z) as in USC-HairSalon's and Cem Yuksel's files. head: a mesh with a vertex group 'scalp' that the strands, in the scene's
+    coordinates, already fit; None fits the built-in mannequin to the roots. Raises CT2HairError; the scene is then untouched.
+    """
+    path = Path(path)
+    strands = read_strands(path)
+    if up not in ("y", "z"):
+        raise CT2HairError(f"up axis '{up}' is not known; choose y or z")
+    if not len(strands) or not (strands.counts > 0).all():
+        raise CT2HairError(f"{path}: holds no strands, or empty ones; export the file again")
+    scale = _strand_scale(path, strands) if unit == "auto" else STRAND_UNITS.get(unit)
+    if scale is None:
+        raise CT2HairError(f"unit '{unit}' is not known; choose auto, {', '.join(STRAND_UNITS)}")
+    place = np.diag([scale, scale, scale, 1.0])
+    if up == "y":
+        place = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ place
+    strands = strands.transformed(place)
+    if head is not None:
+        mesh = head_mesh(head, evaluated=True)
+        world = np.diag([1 / MM, 1 / MM, 1 / MM, 1.0]) @ np.array(head.matrix_world) @ np.diag([MM, MM, MM, 1.0])
+        mesh = mesh.transformed(world)
+        if not np.isfinite(mesh.uv[mesh.scalp]).all():
+            mesh = unwrap(mesh)
+    else:
+        fitted = fit_to_roots(template_head(), strands.roots)
+        to_head = head_from_scan(np.asarray(fitted.matrix))
+        mesh, strands = fitted.head.transformed(to_head), strands.transformed(to_head)
+    distance = float(np.median(np.abs(Head(mesh).signed_distance(strands.roots))))
+    if distance > ROOTS_OFF:
+        raise CT2HairError(
+            f"{path}: the roots lie {distance:.0f} mm from the head (median); check the unit and the axis up, or choose the "
+            "head that the hair was made on"
+        )
+    properties = {"ct2hair_source": str(path.resolve()), "ct2hair_unit": unit, "ct2hair_up": up}
+    return show_strands(
+        strands, mesh, name or scan_name(path), colour=colour, diameter=diameter, properties=properties, context=context
+    )
+
+
+ROOTS_OFF = 25.0
+"""mm; roots farther from the head than this, in the median, are of another head, unit or axis."""
+
+
+def _strand_scale(path: Path, strands: Strands) -> float:
+    """Millimetres a unit of the file, by which the hair's box is 0.12 to 1.2 m large."""
+    extent = float(np.ptp(strands.points, axis=0).max())
+    for scale in STRAND_UNITS.values():
+        if 120.0 <= extent * scale < 1200.0:
+            return scale
+    raise CT2HairError(f"{path}: the hair is {extent:.3g} units large, as no head of hair is in mm, cm or m; choose the unit")
 
 
 def _read_report(folder: Path) -> dict[str, Any]:

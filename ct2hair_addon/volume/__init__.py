@@ -1,6 +1,7 @@
 """Stage 1, the scan: readers, the sparse grid, thresholds and clipping."""
 
 from .grid import BRICK, BrickVolume
+from .inspection import Inspection, inspect_scan
 from .readers import ScanReader, open_scan
 from .thresholds import Thresholds, find_thresholds
 from .vdb import load_vdb, save_vdb
@@ -10,12 +11,14 @@ from .writers import ScanWriter, write_scan
 __all__ = [
     "BRICK",
     "BrickVolume",
+    "Inspection",
     "ScanReader",
     "ScanWriter",
     "Thresholds",
     "WigScan",
     "find_thresholds",
     "import_scan",
+    "inspect_scan",
     "load_vdb",
     "open_scan",
     "save_vdb",

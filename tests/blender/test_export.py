@@ -184,3 +184,19 @@ def test_export_all_brings_the_report_along(result, tmp_path):
     written = scene.export_all(result, tmp_path / "out", formats=("blend", "usd"))
     assert set(written) == {"blend", "usd", "report.html", "report.json"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"hair.blend", "hair.usda", "report.html", "report.json"}
+
+
+def test_usd_passes_the_validators(result, tmp_path):
+    """All validators of usd-core, without an error; materials bound to head, hair and guides."""
+    UsdValidation = pytest.importorskip("pxr.UsdValidation", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(scene.write_usd(result, tmp_path / "hair.usda")))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) >= 15
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert not errors, [error.GetMessage() for error in errors]
+    shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Gprim)]
+    assert len(shapes) == 3
+    for prim in shapes:
+        assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim.GetPath()

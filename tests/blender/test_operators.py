@@ -38,7 +38,7 @@ def stand_in(extension, job_folder, monkeypatch):
             sys.exit({code})
         """)
 
-        def start_job(scan, folder, settings, head=None):
+        def start_job(scan, folder, settings, head=None, until=None, **options):
             log = jobs.JobFolder.create(scan, job_folder, settings)
             process = subprocess.Popen(
                 [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
@@ -204,7 +204,9 @@ def modal(extension, job_folder, monkeypatch):
     monkeypatch.setattr(module, "headless", lambda: False)
     cls, context, reports = module.CT2HAIR_OT_reconstruct, Window(), []
     methods = {key: getattr(cls, key) for key in ("_finish", "_leave", "_wait")}
-    operator = SimpleNamespace(scan=str(job_folder / "volume.vdb"), folder=str(job_folder), _timer=None, reports=reports)
+    operator = SimpleNamespace(
+        scan=str(job_folder / "volume.vdb"), folder=str(job_folder), until="result", _timer=None, reports=reports
+    )
     operator.report = lambda kind, text: reports.append((*kind, text))
     for key, method in methods.items():
         setattr(operator, key, functools.partial(method, operator))
@@ -276,7 +278,7 @@ def test_cancel_ends_the_worker(extension, stand_in, job_folder):
     current.begin(job, job_folder)
     try:
         with pytest.raises(RuntimeError, match="is running"):
-            bpy.ops.ct2hair.reconstruct(scan="x")
+            bpy.ops.ct2hair.clear_cache()
         assert bpy.ops.ct2hair.cancel() == {"FINISHED"}
         job.process.wait(timeout=5)
     finally:

@@ -26,7 +26,7 @@ class Layout:
 
     row = box = column
 
-    def prop(self, data, name, text=None, icon="NONE"):
+    def prop(self, data, name, text=None, icon="NONE", **how):
         assert name in data.bl_rna.properties, f"{data.bl_rna.identifier} has no property {name}"
         assert icon in ICONS
         self.drawn.append(name)
@@ -42,6 +42,17 @@ class Layout:
         self.drawn.append(name)
         return SimpleNamespace()
 
+    def template_icon(self, icon_value=0, scale=1.0):
+        assert isinstance(icon_value, int) and scale > 0
+        self.drawn.append("picture")
+
+    def menu(self, name, text=None):
+        assert hasattr(bpy.types, name)
+        self.drawn.append(name)
+
+    def separator(self):
+        pass
+
     def progress(self, text="", factor=0.0, type="BAR"):
         assert 0 <= factor <= 1 and type in ("BAR", "RING")
         self.drawn.append(f"{factor:.0%} {text}")
@@ -54,6 +65,8 @@ def draw(extension) -> dict[str, list[str]]:
     """What each panel draws now."""
     out = {}
     for cls in extension.panels.sidebar.CLASSES:
+        if hasattr(cls, "poll") and not cls.poll(bpy.context):
+            continue
         drawn = out[cls.__name__.removeprefix("CT2HAIR_PT_")] = []
         methods = {key: getattr(cls, key) for key in dir(cls) if key.startswith("_draw")}
         panel = SimpleNamespace(layout=Layout(drawn), **methods)
@@ -65,7 +78,9 @@ def draw(extension) -> dict[str, list[str]]:
 def test_before_anything_is_done(extension):
     drawn = draw(extension)
     assert {"ct2hair.import_scan", "scan", "spacing"} <= set(drawn["scan"])
-    assert {"preset", "strands", "seed", "face", "up", "ct2hair.reconstruct"} <= set(drawn["reconstruct"])
+    assert {"preset", "strands", "seed", "ct2hair.reconstruct", "CT2HAIR_MT_presets"} <= set(drawn["reconstruct"])
+    assert {"head", "face", "up", "ct2hair.place_head", "ct2hair.paint_scalp"} <= set(drawn["head"])
+    assert "material" not in drawn and "ct2hair.simulate" in drawn["simulate"]
     assert "No result in the scene" in drawn["result"] and "ct2hair.load_result" in drawn["result"]
 
 
@@ -73,8 +88,8 @@ def test_all_parameters_are_within_reach(extension):
     from ct2hair_addon.settings import parameters
 
     drawn = draw(extension)
-    everywhere = set(drawn["parameters"]) | set(drawn["scan"]) | set(drawn["reconstruct"])
-    assert {name.split(".")[1] for name, _ in parameters()} <= everywhere
+    everywhere = {name for panel in drawn.values() for name in panel}
+    assert {name.split(".")[1] for name, _ in parameters()} - {"place"} <= everywhere
 
 
 def test_raw_scans_are_asked_for_their_shape(extension):
@@ -96,7 +111,7 @@ def test_while_a_job_runs(extension, tmp_path):
     try:
         drawn = draw(extension)["reconstruct"]
         assert "Tracing guide strands" in drawn and "42% 42%  2 min left" in drawn
-        assert "ct2hair.cancel" in drawn and "ct2hair.reconstruct" not in drawn
+        assert "ct2hair.cancel" in drawn and "ct2hair.reconstruct" in drawn  # the next one waits in line
     finally:
         current.end("no hair was found in the scan, whose values run from 0 to 12 where hair has 300", failed=True)
     (tmp_path / "log.txt").write_text("log")
@@ -108,5 +123,9 @@ def test_while_a_job_runs(extension, tmp_path):
 
 def test_with_a_result(extension, job_folder):
     extension.ct2hair_addon.scene.load_result(job_folder)
-    drawn = draw(extension)["result"]
-    assert "CT2Hair wig" in drawn and "200 strands" in drawn and "ct2hair.export" in drawn
+    drawn = draw(extension)
+    assert "CT2Hair wig" in drawn["result"] and "200 strands" in drawn["result"] and "ct2hair.show" in drawn["result"]
+    assert "ct2hair.export" in drawn["export"] and "default_value" in drawn["material"]
+    assert not any("cm²" in text for text in drawn["regions"])
+    bpy.ops.ct2hair.measure()
+    assert sum("cm²" in text for text in draw(extension)["regions"]) == 6

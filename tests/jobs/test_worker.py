@@ -27,7 +27,7 @@ from pathlib import Path
 pipeline = types.ModuleType("ct2hair_addon.pipeline")
 
 
-def reconstruct(scan, out, settings, *, raw_shape, raw_type, observer):
+def reconstruct(scan, out, settings, *, raw_shape, raw_type, observer, until):
     from ct2hair_addon.errors import ScanError
 
     observer.started("scan", "reading the scan")
@@ -168,7 +168,7 @@ def test_the_worker_ends_when_its_starter_is_killed(tmp_path):
 
 def test_a_damaged_job_description_is_refused(tmp_path):
     folder = JobFolder.create(tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2")
-    assert folder.read() == (tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2")
+    assert folder.read() == (tmp_path / "a.vdb", tmp_path / "out", Settings(), (1, 2, 3), "<u2", None)
     folder.description.write_text('{"scan": 3')
     with pytest.raises(CT2HairError, match=r"job\.json: not a job description"):
         folder.read()
@@ -180,3 +180,14 @@ def test_messages_come_back_and_other_lines_are_refused():
     for line in ("hello", "[]", '{"kind": "gossip"}'):
         with pytest.raises(ValueError):
             Message.from_line(line)
+
+
+def test_the_worker_keeps_its_kernels_apart_from_blender_s(monkeypatch):
+    """Loaded as bl_ext..., the package compiles kernels that the worker, loaded by its own name, could not read."""
+    from ct2hair_addon.cache import cache_folder
+    from ct2hair_addon.jobs import client
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache_folder() / "kernels" / "bl_ext.user_default.ct2hair.ct2hair_addon"))
+    assert "NUMBA_CACHE_DIR" not in client._environment((), own=True)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/somewhere/else")
+    assert client._environment((), own=True)["NUMBA_CACHE_DIR"] == "/somewhere/else"
