@@ -47,9 +47,9 @@ class Checkpoints:
         return self.folder / f"{stage}.npz"
 
     def save(self, stage: str, key: str, result: Any) -> None:
-        """Write a result beside the stage's file and rename it."""
+        """Write a result beside the stage's file and rename it. Raises TypeError for a dataclass that isn't in `types`."""
         arrays: dict[str, np.ndarray] = {}
-        structure = _frozen(result, arrays)
+        structure = self._frozen(result, arrays)
         arrays[KEY] = np.array(json.dumps({"key": key, "result": structure}))
         self.folder.mkdir(parents=True, exist_ok=True)
         beside = self.folder / f".{stage}.part.npz"
@@ -88,25 +88,26 @@ class Checkpoints:
         fields = {name: self._thawed(item, arrays) for name, item in structure["fields"].items()}
         return self._types[structure["type"]](**fields)
 
-
-def _frozen(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """`value` as JSON, its arrays moved into `arrays`; an array that several fields share is written once."""
-    if isinstance(value, np.ndarray):
-        for name, known in arrays.items():
-            if known is value:
-                return {"array": name}
-        name = f"a{len(arrays)}"
-        arrays[name] = value
-        return {"array": name}
-    if dataclasses.is_dataclass(value):
-        fields = {f.name: _frozen(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
-        return {"type": type(value).__name__, "fields": fields}
-    if isinstance(value, dict):
-        return {"dict": {str(name): _frozen(item, arrays) for name, item in value.items()}}
-    if isinstance(value, tuple):
-        return {"tuple": [_frozen(item, arrays) for item in value]}
-    if isinstance(value, list):
-        return [_frozen(item, arrays) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
+    def _frozen(self, value: Any, arrays: dict[str, np.ndarray]) -> Any:
+        """`value` as JSON, its arrays moved into `arrays`; an array that several fields share is written once."""
+        if isinstance(value, np.ndarray):
+            for name, known in arrays.items():
+                if known is value:
+                    return {"array": name}
+            name = f"a{len(arrays)}"
+            arrays[name] = value
+            return {"array": name}
+        if dataclasses.is_dataclass(value):
+            if self._types.get(type(value).__name__) is not type(value):
+                raise TypeError(f"a checkpoint of {type(value).__qualname__} could not be read again: name it in `types`")
+            fields = {f.name: self._frozen(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
+            return {"type": type(value).__name__, "fields": fields}
+        if isinstance(value, dict):
+            return {"dict": {str(name): self._frozen(item, arrays) for name, item in value.items()}}
+        if isinstance(value, tuple):
+            return {"tuple": [self._frozen(item, arrays) for item in value]}
+        if isinstance(value, list):
+            return [self._frozen(item, arrays) for item in value]
+        if isinstance(value, np.generic):
+            return value.item()
+        return value

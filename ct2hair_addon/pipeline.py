@@ -22,7 +22,7 @@ from . import __version__
 from .checkpoints import Checkpoints, chained_key, fingerprint
 from .errors import CT2HairError
 from .evaluation import write_report
-from .guides import Guides, trace_guides
+from .guides import Guides, StrandProfile, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, machine_memory
@@ -45,7 +45,9 @@ TEXTS = {
     "refinement": "fitting strands to the scan",
     "result": "writing the result",
 }
-_TYPES = (BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, Strands, Thresholds, WigScan)
+_TYPES = (
+    BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds, WigScan,
+)  # fmt: skip
 """What checkpoints are made of."""
 DENSITY_COPIES = 4.0
 """Peak memory of the stages over the density's bricks, as measured on scans of 10^6 to 10^8 hair voxels."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from ct2hair_addon.checkpoints import Checkpoints, chained_key, fingerprint
 from ct2hair_addon.strands import Strands
@@ -78,3 +79,10 @@ def test_fingerprints_tell_files_and_folders_apart(tmp_path):
     assert fingerprint(tmp_path) == whole
     (tmp_path / "b").write_text("tow")
     assert fingerprint(tmp_path) != whole
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints", (Strands, BrickVolume))
+    with pytest.raises(TypeError, match="Result"):
+        checkpoints.save("guides", "key", make())
+    assert not list(tmp_path.rglob("*.npz"))

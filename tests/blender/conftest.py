@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import sys
@@ -12,6 +13,7 @@ import bpy
 import numpy as np
 import pytest
 
+from ct2hair_addon.cache import cache_folder
 from ct2hair_addon.head import HeadMesh
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume, save_vdb
@@ -22,8 +24,16 @@ PACKAGE = "ct2hair_extension"
 
 @pytest.fixture(scope="session")
 def extension() -> ModuleType:
-    """The extension as Blender loads it: the repository as a package whose name it does not know, registered."""
-    spec = importlib.util.spec_from_file_location(PACKAGE, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    """The extension as Blender loads it: the repository as a package whose name it does not know, registered.
+
+    It is loaded through a link, since numba keeps compiled kernels by their source's path and not by their package's name:
+    those of `ct2hair_addon`, which other tests load in the same process, must stay apart.
+    """
+    place = cache_folder() / "tests" / hashlib.sha256(str(ROOT).encode()).hexdigest()[:12]
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if not place.is_symlink():
+        place.symlink_to(ROOT, target_is_directory=True)
+    spec = importlib.util.spec_from_file_location(PACKAGE, place / "__init__.py", submodule_search_locations=[str(place)])
     module = importlib.util.module_from_spec(spec)
     sys.modules[PACKAGE] = module
     spec.loader.exec_module(module)

@@ -44,7 +44,7 @@ import sys
 
 from bl_ext.user_default.ct2hair.ct2hair_addon import cli
 
-assert cli.main(["synthesize", "bob", "--spacing", "1.0", "--strands", "1000", "--out", sys.argv[1]]) == 0
+assert cli.main(["synthesize", "bob", "--spacing", "0.8", "--strands", "2000", "--out", sys.argv[1]]) == 0
 assert bpy.ops.ct2hair.import_scan(filepath=sys.argv[1]) == {"FINISHED"}
 volumes = [ob for ob in bpy.context.scene.objects if ob.type == "VOLUME"]
 assert len(volumes) == 1, volumes

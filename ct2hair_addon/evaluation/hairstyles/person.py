@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...head import Head, HeadMesh
-from ...strands import Strands
+from ...strands import Strands, offsets_from_counts
 from ..distance_field import DistanceField
 
 FIELD_STEP = 1.5
@@ -20,6 +20,9 @@ ROOM = 60.0
 
 LONGEST = 340.0
 """The field reaches this far (mm) below the top of the scalp."""
+
+HOP = -2.0
+"""An edge whose middle is deeper (mm) in the head than this goes through it."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,14 @@ def wisps(
 
 
 def strands_of(who: Person, courses: np.ndarray) -> Strands:
-    """Strands from courses (N, P, 3), rooted exactly, with `root_uv`."""
+    """Strands from courses (N, P, 3), rooted exactly, with `root_uv`.
+
+    One that hops through the head (a shoulder, say, that it was pushed out of on the far side) is cut before the hop.
+    """
     courses = courses.astype(np.float32)
     courses[:, 0] = who.roots
-    return Strands.from_array(courses, root_uv=who.root_uv.astype(np.float32))
+    middles = 0.5 * (courses[:, 1:] + courses[:, :-1])
+    through = who.field.sample(middles.reshape(-1, 3)).reshape(middles.shape[:2]) < HOP
+    counts = np.where(through.any(axis=1), np.maximum(through.argmax(axis=1) + 1, 2), courses.shape[1])
+    kept = courses[np.arange(courses.shape[1]) < counts[:, None]]
+    return Strands(kept, offsets_from_counts(counts), {"root_uv": who.root_uv.astype(np.float32)})
