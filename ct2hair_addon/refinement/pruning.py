@@ -15,7 +15,7 @@ from ..progress import Progress, part, silent
 from ..volume import BrickVolume
 from ..volume.grid import trilinear
 from ..volume.strand_signal import StrandProfile, add_strand
-from .splat import CHUNK, cubic, render, segment_samples
+from .splat import CHUNK, blurred, cubic, render, segment_samples
 
 LEAST_EARNED = 8.0
 """voxel; a strand that earns less than so much of a lone strand's length is left out."""
@@ -32,11 +32,14 @@ def prune(
     density: BrickVolume,
     profile: StrandProfile,
     progress: Progress = silent,
+    reach: float = 0.0,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """(N,) int64: how many control points of each strand stay, 0 for none; and the counts of what went.
 
     points (M, 3) mm, root first, offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. Strands are judged one after
     another, those that earn least first, each against what the others before it have left; the same on any number of threads.
+    reach: voxels by which strands may still be off: scan and rendering are blurred by as much before they are held together,
+    so that one beside hair that nothing else explains is kept.
     """
     counts = np.diff(offsets)
     kept = counts.copy()
@@ -48,10 +51,13 @@ def prune(
     for start in range(0, len(excess), CHUNK):
         excess[start : start + CHUNK] *= np.float32(gain)
         excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
-    peak = gain / (2.0 * np.pi * profile.blur**2)
+    if reach:
+        excess = blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach)
+    blur = float(np.hypot(profile.blur, reach))
+    peak = gain / (2.0 * np.pi * blur**2)
     # what trilinear reads see of a strand's profile on its line and on the ring
-    wide = profile.blur**2 + 1.0 / 6.0
-    seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * profile.blur**2 / wide
+    wide = blur**2 + 1.0 / 6.0
+    seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
     earned = np.empty(len(counts))
     _earn(density.table, excess, voxels, offsets, visible, peak, seen, earned)
     progress(0.8, 1.0)
@@ -60,7 +66,7 @@ def prune(
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
         _cut(
-            density.table, excess, voxels, offsets, visible, order[start : start + step], peak, seen, profile.blur, kept
+            density.table, excess, voxels, offsets, visible, order[start : start + step], peak, seen, blur, kept
         )  # fmt: skip
     progress(1.0, 1.0)
     gone = int(np.count_nonzero((kept == 0) & (counts > 0)))

@@ -17,6 +17,9 @@ from .curves import control_points, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
+MISPLACED = 2.0
+"""voxel; strands may be off by so much before they are fitted, and are not held to be wrong for it."""
+
 
 @dataclass(frozen=True)
 class Refined:
@@ -63,8 +66,10 @@ def refine(
     points, offsets = control_points(kept, settings.points)
     first = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
-    if judged:
-        points, offsets, kept, counts = _pruned(points, offsets, kept, density, profile, boundary, part(progress, 0.05, 0.1))
+    if judged and settings.iterations:
+        points, offsets, kept, counts = _pruned(
+            points, offsets, kept, density, profile, boundary, part(progress, 0.05, 0.1), MISPLACED
+        )
         tally |= {f"{name}, before fitting": count for name, count in counts.items()}
     if settings.iterations and len(kept):
         step = part(progress, 0.1, 0.85)
@@ -86,9 +91,9 @@ def refine(
     return Refined(result, tally, {"before": before, "after": after})
 
 
-def _pruned(points, offsets, strands, density, profile, boundary, progress):
+def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):
     """Control points, offsets and strands without what explains nothing of the scan; and the counts of what went."""
-    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress)
+    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress, reach)
     first = np.repeat(offsets[:-1], np.diff(offsets))
     points = points[np.arange(len(points)) - first < np.repeat(stay, np.diff(offsets))]
     alive = stay > 0
