@@ -20,6 +20,8 @@ VOTERS = 8
 """Neighbouring points each of them listens to."""
 ROUNDS = 200
 """Sweeps of the signs at most; they settle in a few dozen."""
+MEETING, MEETING_COST = 30.0, 2.0
+"""What a joint of cost 0 between two ends says, in neighbouring points' votes, and the cost by which that falls e-fold."""
 SCALP_HINT = 0.02
 """How much the nearness of an end to the scalp says by itself, against neighbours that say about 1."""
 
@@ -58,12 +60,19 @@ def fine_ends(strands: Strands, head: Head, settings: GuideSettings) -> np.ndarr
     return np.where(np.isfinite(merit.max(axis=0)), sign, 0).astype(np.int8)
 
 
-def signs(strands: Strands, fine: np.ndarray, head: Head, settings: GuideSettings) -> np.ndarray:
+def signs(
+    strands: Strands,
+    fine: np.ndarray,
+    head: Head,
+    settings: GuideSettings,
+    meeting: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """(N,) float64 in [-1, 1]: above 0 where a strand runs root to tip as it is, below where it must be turned, magnitude
     for certainty.
 
     Fine strands are sure. The others take the sign that agrees best with their neighbours along the hair: the mean-field
-    solution of a signed graph of strands, an edge the summed agreement of their neighbouring points' tangents.
+    solution of a signed graph of strands, an edge the summed agreement of their neighbouring points' tangents. meeting: pairs
+    of strands whose ends meet, with sign and cost (`linking.meeting_ends`): edges too, since hair goes on as it came.
     """
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
@@ -92,6 +101,10 @@ def signs(strands: Strands, fine: np.ndarray, head: Head, settings: GuideSetting
         ),
         shape=(count, count),
     ).tocsr()
+    if meeting is not None:
+        pairs, sign, cost = meeting
+        weight = MEETING * sign * np.exp(-cost / MEETING_COST)
+        graph = graph + coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
     graph = graph + graph.T
     scale = np.asarray(abs(graph).sum(axis=1)).ravel()
     near_root = head.closest_scalp(strands.roots).distance.astype(np.float64)

@@ -7,36 +7,51 @@ The cheapest set of joints in which no end is used twice is an assignment proble
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ..progress import Progress, silent
+from ..progress import Progress, part, silent
 from ..strands import Strands, offsets_from_counts
 from ..volume.grid import BrickVolume, trilinear
 
-CUTS = (0.0, 2.5, 5.0, 8.0)
-"""voxel; a trace may have gone too far, onto a neighbour: a joint may leave it this far before its end."""
+CUTS = (0.0, 4.0, 8.0, 12.0)
+"""voxel; a trace may have gone too far, onto a neighbour: a joint may leave it this far before its end, and enter another
+this far behind its beginning."""
+CONTACT = 2.0
+"""voxel; where a trace ends this close to another's side, the other is cut: it may have come over to the wrong strand there."""
+NEAR_STATIONS = 3
+"""Stations that are looked at from a cut: what goes on there lies near."""
+SHORTEST = 12
+"""voxel; no cut is made closer to an end or another cut."""
+ACROSS = 4.0
+"""voxel to both sides of a cut that are left out when its going straight on is weighed: smoothing hides a hop."""
 STATIONS = ((2.0, 3.5), (7.0, 4.5), (14.0, 5.5), (23.0, 7.0), (34.0, 8.5))
 """voxel; root ends are looked for around these points ahead of a tip, within these radii."""
 NEAREST = 12
 """Root ends looked at around each station."""
-SPAN = 9.0
+SPAN = 12.0
 """voxel; the length at an end that its course is fitted to."""
-PLACE = (0.75, 0.09)
+PLACE = (2.0, 0.1)
 """voxel, and voxel a voxel of gap: how far the two courses may miss each other in the middle of a gap."""
-TURN = (0.16, 0.012)
+TURN = (0.5, 0.02)
 """radian, and radian a voxel of gap: by how much their directions may differ there."""
-PER_VOXEL = 0.10
+BEND = (0.08, 0.004)
+"""1/voxel, and 1/voxel a voxel of gap: by how much their bends may differ: a curl's turns on as it came."""
+KINK = 0.06
+KINK_SPAN = 10
+"""1/voxel; a trace is cut where its bend changes by more from one span (voxel) to the next: it may have left its strand."""
+PER_VOXEL = 0.5
 UNBACKED = 6.0
 """Cost of a voxel of gap, and of a gap that the scan does not back at all."""
-PER_CUT = 0.25
+PER_CUT = 0.02
 """Cost of a voxel that is cut off a trace."""
-LOOSE_END = 14.0
+LOOSE_END = 30.0
 """Cost of a tip that goes on nowhere: joints dearer than this are not made."""
 STEP = 1.0
 """voxel between the points of a joint."""
@@ -44,7 +59,7 @@ STEP = 1.0
 
 @dataclass(frozen=True)
 class _Joints:
-    """Candidates: strand `tip` goes on in strand `root`; `cut` points are left off the tip; cost."""
+    """Candidates: piece `tip` goes on in piece `root`; cut (J, 2): points left off the one's tip and the other's root."""
 
     tip: np.ndarray
     root: np.ndarray
@@ -52,41 +67,186 @@ class _Joints:
     cost: np.ndarray
 
 
+@dataclass(frozen=True)
+class Pieces:
+    """Segments in pieces: strands (mm), points a voxel apart; onward (P,) int64: the piece that each went on in, or -1; parent
+    (P,): the segment that each is of."""
+
+    strands: Strands
+    onward: np.ndarray
+    parent: np.ndarray
+
+    def turned(self, back: np.ndarray) -> Pieces:
+        """The pieces with those of `back` (P,) bool turned; two that now run against each other don't go on in each other."""
+        before = np.flatnonzero(self.onward >= 0)
+        after = self.onward[before]
+        ahead, behind = ~back[before] & ~back[after], back[before] & back[after]
+        onward = np.full(len(self.onward), -1, np.int64)
+        onward[before[ahead]] = after[ahead]
+        onward[after[behind]] = before[behind]
+        return Pieces(self.strands.reversed(back), onward, self.parent)
+
+    def ends(self, fine: np.ndarray) -> np.ndarray:
+        """(P,) int8: `fine` (N,) of the segments (1: the first point is a root, -1: the last one is) for the pieces."""
+        out = np.zeros(len(self.onward), np.int8)
+        first = np.ones(len(out), bool)
+        first[self.onward[self.onward >= 0]] = False
+        last = self.onward < 0
+        out[first & (fine[self.parent] > 0)] = 1
+        out[last & (fine[self.parent] < 0)] = -1
+        return out
+
+
+def cut_segments(segments: Strands, voxel: float) -> Pieces:
+    """Undirected segments (mm) in pieces, cut where another one's end lies beside them and where their bend changes at once."""
+    lines = segments.resampled_by_step(STEP * voxel)
+    if not len(lines):
+        return Pieces(lines, np.zeros(0, np.int64), np.zeros(0, np.int64))
+    tangents, index = lines.tangents(), lines.strand_index
+    ends = np.concatenate([lines.offsets[:-1], lines.offsets[1:] - 1])
+    tree = cKDTree(lines.points)
+    near = tree.query(lines.points[ends], k=24, distance_upper_bound=CONTACT * voxel, workers=-1)[1]
+    row, column = np.nonzero(near < len(lines.points))
+    place, end = near[row, column], ends[row]
+    beside = (index[place] != index[end]) & (np.abs(np.einsum("nc,nc->n", tangents[place], tangents[end])) > 0.7)
+    place, row, column = place[beside], row[beside], column[beside]
+    # of each line beside an end the nearest point, which the tree gives first
+    order = np.lexsort((column, index[place], row))
+    place, row = place[order], row[order]
+    first = np.ones(len(place), bool)
+    first[1:] = (row[1:] != row[:-1]) | (index[place[1:]] != index[place[:-1]])
+    cuts = np.unique(
+        np.concatenate([place[first], np.flatnonzero(_kinks(lines.points, lines.offsets, voxel, _bend_weights()))])
+    )
+    cuts = cuts[(cuts - lines.offsets[index[cuts]] >= SHORTEST) & (lines.offsets[index[cuts] + 1] - cuts > SHORTEST)]
+    cuts = cuts[_apart(cuts, SHORTEST)]
+    offsets = np.sort(np.concatenate([lines.offsets, cuts]))
+    onward = np.where(np.isin(offsets[1:-1], cuts, assume_unique=True), np.arange(1, len(offsets) - 1), -1)
+    return Pieces(Strands(lines.points, offsets), np.append(onward, -1).astype(np.int64), index[offsets[:-1]])
+
+
+def _bend_weights() -> np.ndarray:
+    """(KINK_SPAN + 1,): the second derivative of the parabola through as many places, a voxel apart, as their weighted sum."""
+    t = np.arange(KINK_SPAN + 1, dtype=np.float64)
+    return 2.0 * np.linalg.pinv(np.stack([np.ones_like(t), t, t * t], axis=1))[2]
+
+
+@numba.njit(cache=True, parallel=True)
+def _kinks(points, offsets, voxel, weights):
+    """(M,) bool: where the bend before and the bend behind a point differ by more than KINK, and most for SHORTEST around."""
+    out = np.zeros(len(points), np.bool_)
+    span = len(weights) - 1
+    for n in numba.prange(len(offsets) - 1):
+        start, end = offsets[n], offsets[n + 1]
+        if end - start <= 2 * span:
+            continue
+        jump = np.zeros(end - start)
+        for m in range(start + span, end - span):
+            square = 0.0
+            for axis in range(3):
+                bend = 0.0
+                for k in range(span + 1):
+                    bend += weights[k] * (points[m + k, axis] - points[m - k, axis])
+                square += bend * bend
+            jump[m - start] = np.sqrt(square) / voxel
+        for m in range(span, end - start - span):
+            if jump[m] > KINK:
+                most = True
+                for k in range(max(m - SHORTEST, 0), min(m + SHORTEST + 1, end - start)):
+                    if jump[k] > jump[m]:
+                        most = False
+                        break
+                out[start + m] = most
+    return out
+
+
+@numba.njit(cache=True)
+def _apart(places, least):
+    """(C,) bool: of rising places those that lie `least` behind the last one taken."""
+    taken = np.zeros(len(places), np.bool_)
+    last = -least
+    for n in range(len(places)):
+        if places[n] - last >= least:
+            taken[n] = True
+            last = places[n]
+    return taken
+
+
 def link_segments(
-    segments: Strands,
+    pieces: Pieces,
     rooted: np.ndarray,
     density: BrickVolume,
     strand: float,
     progress: Progress = silent,
 ) -> tuple[Strands, np.ndarray, np.ndarray, dict[str, int]]:
-    """Chains of directed segments (mm, scan frame, root end first).
+    """Chains of directed pieces of segments (mm, scan frame, root end first).
 
-    rooted: (N,) bool, segments whose first point is a root on the scalp: nothing goes on into them. density: the scan; strand:
+    rooted: (P,) bool, pieces whose first point is a root on the scalp: nothing goes on into them. density: the scan; strand:
     a lone strand's density on its centre line as trilinear reads see it. Returns (chains, (C,) bool rooted, (C,) float32 mm
     bridged in each, tally).
     """
-    voxel = density.spacing
-    lines = segments.resampled_by_step(STEP * voxel)
+    voxel, lines, onward = density.spacing, pieces.strands, pieces.onward
     count = len(lines)
     rooted = np.asarray(rooted, bool)
     if count < 2:
         return lines, rooted, np.zeros(count, np.float32), {"segments joined": 0}
-    joints = _candidates(lines, rooted, density, strand, progress)
+    joints = _candidates(lines, rooted, onward, density, strand, part(progress, 0.0, 0.5))
     following, cut = _assigned(count, joints)
-    progress(0.8, 1.0)
+    progress(0.9, 1.0)
     following, broken = _without_rings(following, joints)
     chain, position, length = _chains(following)
     points, offsets, bridged = _joined(lines, following, cut, chain, position, length, voxel)
     firsts = np.flatnonzero(position == 0)
     order = np.argsort(chain[firsts])
+    healed = (following == onward) & (onward >= 0)
     tally = {
+        "cuts of segments: an end beside them, or a kink": len(pieces.parent) - len(np.unique(pieces.parent)),
+        "cuts that were healed": int(healed.sum()),
         "joints weighed": len(joints.cost),
-        "segments joined": int((following >= 0).sum()),
+        "joints made": int(((following >= 0) & ~healed).sum()),
         "joints undone: they closed a ring": broken,
         "strands after joining": len(offsets) - 1,
     }
     progress(1.0, 1.0)
     return Strands(points, offsets), rooted[firsts[order]], bridged, tally
+
+
+def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ends of undirected pieces that one strand may run through, whichever way.
+
+    density, strand: as for `link_segments`. Returns (pairs (J, 2) of pieces, sign (J,) 1 where a strand that runs through
+    both runs along both or against both and -1 where not, cost (J,) of the joint).
+    """
+    voxel, lines, onward = density.spacing, pieces.strands, pieces.onward
+    count = len(lines)
+    ends = [np.concatenate(two) for two in zip(*(_courses(lines, first, 0.0, voxel) for first in (True, False)), strict=True)]
+    valid, place, out, bend = ends
+    usable = np.flatnonzero(valid)
+    tree = cKDTree(place[usable])
+    pairs = []
+    for ahead, radius in STATIONS[:NEAR_STATIONS]:
+        for bent in (0.0, 0.5):
+            centre = place[usable] + ahead * out[usable] + bent * ahead**2 * bend[usable]
+            near = tree.query(centre, k=min(NEAREST, len(usable)), distance_upper_bound=radius, workers=-1)[1]
+            row, column = np.nonzero(near.reshape(len(usable), -1) < len(usable))
+            one, other = usable[row], usable[near.reshape(len(usable), -1)[row, column]]
+            pairs.append(np.minimum(one, other) * (2 * count) + np.maximum(one, other))
+    pair = np.unique(np.concatenate(pairs))
+    one, other = pair // (2 * count), pair % (2 * count)
+    # an end of one piece at the beginning of the next is weighed as a cut
+    kept = (one % count != other % count) & (onward[one % count] != other % count) & (onward[other % count] != one % count)
+    one, other = one[kept], other[kept]
+    cost = np.empty(len(one))
+    _weigh(
+        one, other, place, out, bend, place, out, bend, density.table, density.bricks, density.origin / voxel,
+        np.float32(strand), cost,
+    )  # fmt: skip
+    kept = cost < LOOSE_END
+    one, other = one[kept], other[kept]
+    sign = np.where((one < count) == (other < count), -1.0, 1.0)
+    tip, root, _, healed = _healed(lines, onward, density, strand)
+    pairs = np.stack([np.append(one % count, tip), np.append(other % count, root)], axis=1)
+    return pairs, np.append(sign, np.ones(len(tip))), np.append(cost[kept], healed)
 
 
 def _courses(lines: Strands, from_root: bool, cut: float, voxel: float):
@@ -148,51 +308,74 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
             tangent[n, axis] /= max(norm, 1e-9)
 
 
-def _candidates(lines: Strands, rooted: np.ndarray, density: BrickVolume, strand: float, progress: Progress) -> _Joints:
-    """All joints worth weighing, the cheapest for each pair."""
-    voxel = density.spacing
-    root_valid, root_place, root_out, root_bend = _courses(lines, True, 0.0, voxel)
-    targets = np.flatnonzero(root_valid & ~rooted)
-    nothing = _Joints(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    if not len(targets):
-        return nothing
-    tree = cKDTree(root_place[targets])
-    found = []
-    for number, cut in enumerate(CUTS):
-        progress(0.7 * number / len(CUTS), 1.0)
-        valid, place, out, bend = _courses(lines, False, cut, voxel)
-        tips = np.flatnonzero(valid)
-        if not len(tips):
+def _candidates(
+    lines: Strands, rooted: np.ndarray, onward: np.ndarray, density: BrickVolume, strand: float, progress: Progress
+) -> _Joints:
+    """All joints worth weighing, the cheapest for each pair; those that heal a cut leave nothing off."""
+    voxel, count = density.spacing, len(lines)
+    found = [_healed(lines, onward, density, strand)]
+    number, steps = 0, len(CUTS) ** 2
+    for root_cut in CUTS:
+        root_valid, root_place, root_out, root_bend = _courses(lines, True, root_cut, voxel)
+        targets = np.flatnonzero(root_valid & ~rooted)
+        if not len(targets):
             continue
-        pairs = []
-        for ahead, radius in STATIONS:
-            for bent in (0.0, 0.5):
-                centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
-                distance, near = tree.query(centre, k=min(NEAREST, len(targets)), distance_upper_bound=radius)
-                row, column = np.nonzero(np.isfinite(distance.reshape(len(tips), -1)))
-                near = near.reshape(len(tips), -1)
-                pairs.append(tips[row].astype(np.int64) * len(lines) + targets[near[row, column]])
-        pair = np.unique(np.concatenate(pairs))
-        tip, root = pair // len(lines), pair % len(lines)
-        kept = tip != root
-        tip, root = tip[kept], root[kept]
-        cost = np.empty(len(tip))
-        _weigh(
-            tip, root, place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
-            density.origin / voxel, np.float32(strand), cost,
-        )  # fmt: skip
-        cost += PER_CUT * cut
-        kept = cost < LOOSE_END
-        shift = np.full(int(kept.sum()), round(cut / STEP), np.int64)
-        found.append((tip[kept], root[kept], shift, cost[kept]))
-    if not found:
-        return nothing
+        tree = cKDTree(root_place[targets])
+        for cut in CUTS:
+            progress(number, steps)
+            number += 1
+            valid, place, out, bend = _courses(lines, False, cut, voxel)
+            tips = np.flatnonzero(valid)
+            if not len(tips):
+                continue
+            pairs = []
+            for number_of, (ahead, radius) in enumerate(STATIONS):
+                if number_of == NEAR_STATIONS:
+                    tips = tips[onward[tips] < 0]
+                for bent in (0.0, 0.5):
+                    centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
+                    near = tree.query(centre, k=min(NEAREST, len(targets)), distance_upper_bound=radius, workers=-1)[1]
+                    near = near.reshape(len(tips), -1)
+                    row, column = np.nonzero(near < len(targets))
+                    pairs.append(tips[row].astype(np.int64) * count + targets[near[row, column]])
+            pair = np.unique(np.concatenate(pairs))
+            tip, root = pair // count, pair % count
+            kept = (tip != root) & (onward[tip] != root)
+            tip, root = tip[kept], root[kept]
+            cost = np.empty(len(tip))
+            _weigh(
+                tip, root, place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
+                density.origin / voxel, np.float32(strand), cost,
+            )  # fmt: skip
+            cost += PER_CUT * (cut + root_cut)
+            kept = cost < LOOSE_END
+            left = np.broadcast_to([round(cut / STEP), round(root_cut / STEP)], (int(kept.sum()), 2))
+            found.append((tip[kept], root[kept], left, cost[kept]))
     tip, root, cut, cost = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    order = np.lexsort((cut, cost, root, tip))
+    order = np.lexsort((cut.sum(axis=1), cost, root, tip))
     tip, root, cut, cost = tip[order], root[order], cut[order], cost[order]
     first = np.ones(len(tip), bool)
     first[1:] = (tip[1:] != tip[:-1]) | (root[1:] != root[:-1])
-    return _Joints(tip[first], root[first], cut[first], cost[first])
+    tip, root, cut, cost = tip[first], root[first], cut[first], cost[first]
+    return _Joints(tip, root, cut, cost)
+
+
+def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: float):
+    """The joints that heal a cut, weighed by how the courses at some distance to both sides of it meet."""
+    voxel = density.spacing
+    tip = np.flatnonzero(onward >= 0)
+    root = onward[tip]
+    cost = np.zeros(len(tip))
+    valid, place, out, bend = _courses(lines, False, ACROSS, voxel)
+    root_valid, root_place, root_out, root_bend = _courses(lines, True, ACROSS, voxel)
+    both = valid[tip] & root_valid[root]
+    some = np.empty(int(both.sum()))
+    _weigh(
+        tip[both], root[both], place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
+        density.origin / voxel, np.float32(strand), some,
+    )  # fmt: skip
+    cost[both] = np.clip(some - PER_VOXEL * 2.0 * ACROSS, 0.0, 0.9 * LOOSE_END)
+    return tip, root, np.zeros((len(tip), 2), np.int64), cost
 
 
 @numba.njit(cache=True, parallel=True)
@@ -230,6 +413,10 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
             turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
             value = miss / (PLACE[0] + PLACE[1] * gap) ** 2 + (turn / (TURN[0] + TURN[1] * gap)) ** 2
             best = min(best, value)
+        jump = 0.0
+        for axis in range(3):
+            jump += (bend[a, axis] - root_bend[b, axis]) ** 2
+        best += jump / (BEND[0] + BEND[1] * gap) ** 2
         backed = 0.0
         many = int(gap) + 1
         for m in range(many):
@@ -244,25 +431,78 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
 
 
 def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
-    """(following (N,): the segment that each goes on in, -1 for none; cut (N,) points left off its tip) at the least cost."""
-    following, cut = np.full(count, -1, np.int64), np.zeros(count, np.int64)
+    """(following (N,): the piece that each goes on in, -1 for none; cut (N, 2): points left off its root and its tip) at the
+    least cost."""
+    following, cut = np.full(count, -1, np.int64), np.zeros((count, 2), np.int64)
     if not len(joints.cost):
         return following, cut
-    tips, row = np.unique(joints.tip, return_inverse=True)
-    roots, column = np.unique(joints.root, return_inverse=True)
-    # a tip that goes on nowhere is matched to a column of its own; costs must not be 0 in a sparse matrix
-    size = len(tips)
-    rows = np.concatenate([row, np.arange(size)])
-    columns = np.concatenate([column, len(roots) + np.arange(size)])
-    costs = np.concatenate([joints.cost, np.full(size, LOOSE_END)]) + 1.0
-    graph = coo_matrix((costs, (rows, columns)), shape=(size, len(roots) + size)).tocsr()
-    matched_row, matched_column = min_weight_full_bipartite_matching(graph)
-    joined = matched_column < len(roots)
-    tip, root = tips[matched_row[joined]], roots[matched_column[joined]]
-    following[tip] = root
+    starts = np.searchsorted(joints.tip, np.arange(count + 1))
+    _assign(starts, joints.root, joints.cost, LOOSE_END, following)
+    tip = np.flatnonzero(following >= 0)
+    root = following[tip]
     key = joints.tip * count + joints.root
-    cut[tip] = joints.cut[np.searchsorted(key, tip * count + root)]
+    chosen = joints.cut[np.searchsorted(key, tip * count + root)]
+    cut[tip, 1], cut[root, 0] = chosen[:, 0], chosen[:, 1]
     return following, cut
+
+
+@numba.njit(cache=True)
+def _assign(starts, columns, costs, loose, chosen):
+    """Fill `chosen` (R,): each row's column, or -1, at the least sum of costs, `loose` for a row without one.
+
+    Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`. Shortest augmenting paths over reduced costs
+    (Jonker and Volgenant 1987); each search ends where leaving somebody loose is cheapest, so it stays among neighbours.
+    """
+    rows = len(chosen)
+    owner = np.full(rows, -1, np.int64)
+    row_price, column_price = np.zeros(rows), np.zeros(rows)
+    distance, before = np.empty(rows), np.empty(rows, np.int64)
+    seen, done = np.full(rows, -1, np.int64), np.full(rows, -1, np.int64)
+    for first in range(rows):
+        heap = [(0.0, np.int64(-1)) for _ in range(0)]
+        scanned = [np.int64(0) for _ in range(0)]
+        row, far = first, 0.0
+        nearest, last_row, last_column = np.inf, first, -1
+        while True:
+            if far + loose - row_price[row] < nearest:
+                nearest, last_row, last_column = far + loose - row_price[row], row, -1
+            for k in range(starts[row], starts[row + 1]):
+                column = columns[k]
+                if done[column] == first:
+                    continue
+                way = far + costs[k] - row_price[row] - column_price[column]
+                if way < nearest and (seen[column] != first or way < distance[column]):
+                    seen[column], distance[column], before[column] = first, way, row
+                    heapq.heappush(heap, (way, column))
+            column = np.int64(-1)
+            while len(heap):
+                far, column = heapq.heappop(heap)
+                if done[column] != first and far <= distance[column]:
+                    break
+                column = np.int64(-1)
+            if column < 0 or far >= nearest:
+                break
+            if owner[column] < 0:
+                nearest, last_column = far, column
+                break
+            done[column] = first
+            scanned.append(column)
+            row = owner[column]
+        for column in scanned:
+            less = nearest - distance[column]
+            column_price[column] -= less
+            row_price[owner[column]] += less
+        row_price[first] += nearest
+        if last_column < 0:
+            row, column = last_row, chosen[last_row]
+            chosen[row] = -1
+        else:
+            row, column = np.int64(-1), last_column
+        while row != first:
+            row = before[column]
+            freed = chosen[row]
+            chosen[row], owner[column] = column, row
+            column = freed
 
 
 def _without_rings(following: np.ndarray, joints: _Joints) -> tuple[np.ndarray, int]:
@@ -308,13 +548,14 @@ def _chains(following: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _joined(lines: Strands, following, cut, chain, position, length, voxel):
     """(points, offsets, bridged (C,) mm) of the chains: their segments in order, with a cubic Hermite piece in each gap."""
     order = np.lexsort((position, chain))
-    tips = lines.offsets[1:] - 1 - cut
-    roots = lines.offsets[:-1]
+    tips = lines.offsets[1:] - 1 - cut[:, 1]
+    roots = lines.offsets[:-1] + cut[:, 0]
     linked = following[order] >= 0
     gap = np.zeros(len(order))
     after = following[order][linked]
     gap[linked] = np.linalg.norm(lines.points[roots[after]] - lines.points[tips[order][linked]], axis=1)
-    between = np.where(linked, np.maximum(np.ceil(gap / (STEP * voxel)).astype(np.int64) - 1, 0), 0)
+    gap = np.maximum(gap - STEP * voxel, 0.0)  # what heals a cut bridges nothing
+    between = np.where(linked, np.ceil(gap / (STEP * voxel)).astype(np.int64), 0)
     kept = tips[order] - roots[order] + 1
     starts = offsets_from_counts(kept + between)
     points = np.empty((starts[-1], 3), np.float32)

@@ -14,7 +14,7 @@ from ..strands import Strands
 from ..volume.grid import BrickVolume
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
-from .linking import link_segments
+from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
 from .profile import StrandProfile, strand_profile
 from .seeds import seed_order, seed_voxels
@@ -116,18 +116,22 @@ def root_segments(
     """
     tally: dict[str, int] = {}
     fine = fine_ends(segments, head, settings)
-    progress(0.1, 1.0)
-    value = signs(segments, fine, head, settings)
-    progress(0.3, 1.0)
-    directed = segments.reversed(value < 0)
     tally["fine segments"] = int((fine != 0).sum())
     tally["poor segments"] = int((fine == 0).sum())
-    tally["poor segments without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
-    rooted = fine != 0
-    bridged = np.zeros(len(directed), np.float32)
-    if scan is not None and settings.link:
-        directed, rooted, bridged, joints = link_segments(directed, rooted, scan, strand, part(progress, 0.3, 0.5))
+    progress(0.1, 1.0)
+    if scan is not None and settings.link and len(segments):
+        pieces = cut_segments(segments, spacing)
+        fine = pieces.ends(fine)
+        value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand))
+        progress(0.3, 1.0)
+        directed, rooted, bridged, joints = link_segments(
+            pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5)
+        )
         tally |= joints
+    else:
+        value = signs(segments, fine, head, settings)
+        directed, rooted, bridged = segments.reversed(value < 0), fine != 0, np.zeros(len(segments), np.float32)
+    tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
     traced = directed.lengths() - bridged
     bodies, reached, grown = grow_to_root(directed.resampled_by_step(_step(spacing)), rooted, settings)
     progress(0.7, 1.0)

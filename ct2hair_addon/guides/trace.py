@@ -31,6 +31,10 @@ RINGS = ((0.12, 6), (0.26, 8), (0.45, 10))
 """Directions tried around the present one: (tangent of the angle, how many)."""
 TURN_COST = 0.8
 """Share of a strand's density that a turn by one radian in one step must win to be taken."""
+BEND_SPAN = 8
+"""Steps between the three points of a path that its bend is taken from."""
+LEAST_BEND = 0.02
+"""1/voxel; less is noise: a bend of this size and below is not looked ahead along."""
 SUPPORT = 0.4
 """Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
 SHARPNESS = 0.06
@@ -82,6 +86,16 @@ def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, 
         if count == len(path):
             return count, End.LONG
         ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
+        # Hair goes on bending as it did: the look-ahead bends along, or in a curl it would see the neighbours.
+        bx = by = bz = 0.0
+        if count > 2 * BEND_SPAN:
+            p, q, r = path[count - 1], path[count - 1 - BEND_SPAN], path[count - 1 - 2 * BEND_SPAN]
+            bx, by, bz = p[0] - 2.0 * q[0] + r[0], p[1] - 2.0 * q[1] + r[1], p[2] - 2.0 * q[2] + r[2]
+            along = bx * dx + by * dy + bz * dz
+            bx, by, bz = bx - along * dx, by - along * dy, bz - along * dz
+            noise = (LEAST_BEND * (BEND_SPAN * step) ** 2) ** 2
+            scale = max(1.0 - noise / max(bx * bx + by * by + bz * bz, 1e-12), 0.0) / (BEND_SPAN * step) ** 2
+            bx, by, bz = scale * bx, scale * by, scale * bz
         best, chosen, backed = -1e30, 0, 0.0
         for n in range(len(fan)):
             a, b = fan[n, 0], fan[n, 1]
@@ -91,7 +105,9 @@ def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, 
             ex, ey, ez = ex * norm, ey * norm, ez * norm
             total = 0.0
             for k in range(len(weights)):
-                value = density_at(table, bricks, x + (k + 1) * ex, y + (k + 1) * ey, z + (k + 1) * ez) / seen
+                far, bent = k + 1.0, 0.5 * (k + 1.0) ** 2
+                px, py, pz = x + far * ex + bent * bx, y + far * ey + bent * by, z + far * ez + bent * bz
+                value = density_at(table, bricks, px, py, pz) / seen
                 total += weights[k] * min(value, 1.3)
             total /= whole
             scores[n] = total - TURN_COST * (square - 1.0)
