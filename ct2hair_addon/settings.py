@@ -159,14 +159,14 @@ class RefinementSettings:
         choices=("volume", "chamfer"),
     )
     iterations: int = parameter(40, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
-    points: int = parameter(64, "control points of each strand at most", low=8, high=256)
+    points: int = parameter(128, "control points of each strand at most", low=8, high=256)
     prune: bool = parameter(
         True, "volume: strands and tips that explain nothing of the scan go, so that the scan tells how many there are"
     )
     coarsest: float = parameter(
         0.5, "volume: largest voxel of the coarse-to-fine search: how far strands are drawn", unit="mm", low=0.01, high=20.0
     )
-    stiffness: float = parameter(3.0, "volume: shape is kept below about six times this length", unit="mm", low=0.0, high=100.0)
+    stiffness: float = parameter(1.0, "volume: shape is kept below about six times this length", unit="mm", low=0.0, high=100.0)
     rate: float = parameter(0.1, "chamfer: learning rate of Adam", unit="mm", low=1e-4, high=10.0)
     batch: int = parameter(1600, "chamfer: neighbouring strands optimised together", low=1, high=100_000)
     targets: int = parameter(16, "chamfer: nearest points of the scan per strand point (k_o)", low=1, high=64)
@@ -311,9 +311,9 @@ _PARAMETERS = dict(parameters())
 _TYPES = {"float": float, "int": int, "str": str, "bool": bool}
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"refinement.iterations": 15, "refinement.points": 32},
+    "draft": {"refinement.iterations": 15, "refinement.points": 64},
     "standard": {},
-    "final": {"refinement.iterations": 150, "refinement.points": 96},
+    "final": {"refinement.iterations": 120, "refinement.points": 192},
     "paper": {
         "orientation.sigma": 0.0,
         "orientation.reweighting": 1,

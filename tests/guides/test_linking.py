@@ -1,0 +1,123 @@
+"""Joining segments: the assignment is the best there is, hops are undone, gaps bridged, curls kept apart by their bend."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
+from ct2hair_addon.evaluation import render_density, strand_peak
+from ct2hair_addon.guides.linking import _assign, cut_segments, link_segments, meeting_ends
+from ct2hair_addon.strands import Strands
+
+SPACING, BLUR = 0.4, 0.85
+SEEN = strand_peak(BLUR) * BLUR**2 / (BLUR**2 + 1.0 / 6.0)
+
+
+def joined(lines, truth, rooted=()):
+    """The chains of directed lines (mm) in a scan of the `truth`; `rooted`: those that begin on the scalp."""
+    density = render_density(Strands.from_polylines(truth), SPACING, BLUR)
+    pieces = cut_segments(Strands.from_polylines(lines), SPACING)
+    fine = np.isin(np.arange(len(lines)), rooted).astype(np.int8)
+    return link_segments(pieces, pieces.ends(fine) != 0, density, SEEN)
+
+
+def crossing():
+    """Two strands that touch in the middle, 60 mm long, 0.1 mm apart there and 7 mm at the ends."""
+    x = np.arange(0.0, 60.0, 0.25)
+    rise = 0.05 + 0.12 * np.sqrt((x - 30.0) ** 2 + 4.0) - 0.24
+    one = np.stack([x, rise * np.sign(x - 30.0), 0.0 * x], axis=1)
+    return one, one * [1.0, -1.0, 1.0]
+
+
+def match(chain, truth):
+    """(near, far): the largest distance (mm) of a chain's points from a true strand, and of the strand's from it."""
+    apart = np.linalg.norm(chain[:, None] - truth[None], axis=2)
+    return apart.min(axis=1).max(), apart.min(axis=0).max()
+
+
+@pytest.mark.parametrize(("rows", "seed"), [(6, 0), (40, 1), (400, 2), (3000, 3)])
+def test_the_assignment_is_the_cheapest(rows, seed):
+    generator, loose = np.random.default_rng(seed), 20.0
+    key = np.unique(generator.integers(0, rows * rows, 6 * rows))
+    row, column = key // rows, key % rows
+    cost = generator.uniform(0, 30, len(key))
+    chosen = np.full(rows, -1, np.int64)
+    _assign(np.searchsorted(row, np.arange(rows + 1)), column, cost, loose, chosen)
+    has = np.flatnonzero(chosen >= 0)
+    assert len(np.unique(chosen[has])) == len(has)
+    found = cost[np.searchsorted(key, has * rows + chosen[has])].sum() + loose * (rows - len(has))
+    # the same by scipy, which wants a column for each row and no cost of 0
+    entries = np.append(cost, np.full(rows, loose)) + 1.0
+    places = np.append(row, np.arange(rows)), np.append(column, rows + np.arange(rows))
+    graph = coo_matrix((entries, places), shape=(rows, 2 * rows)).tocsr()
+    best = np.asarray(graph[min_weight_full_bipartite_matching(graph)]).sum() - rows
+    assert found == pytest.approx(best, rel=1e-9)
+
+
+def test_a_gap_is_bridged_along_the_bend():
+    angle = np.linspace(0, 2.0, 200)
+    arc = 20.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    chains, rooted, bridged, tally = joined([arc[:90], arc[110:]], [arc], rooted=[0])
+    assert len(chains) == 1 and rooted.tolist() == [True] and tally["joints made"] == 1
+    assert match(chains.points, arc)[0] < 0.15
+    assert chains.lengths()[0] == pytest.approx(40.0, rel=0.02)
+    assert 3.0 < bridged[0] < 12.0
+
+
+def test_two_that_do_not_go_on_in_each_other_stay_apart():
+    x = np.arange(0.0, 20.0, 0.25)[:, None]
+    one, other = x * [1.0, 0, 0], [30.0, 0, 0] + x * [0, 1.0, 0]
+    far = [25.0, 8.0, 0] + x * [1.0, 0, 0]
+    chains, _, bridged, _ = joined([one, other, far], [one, other, far])
+    assert len(chains) == 3 and not bridged.any()
+
+
+def test_a_trace_that_hopped_is_cut_and_each_strand_gets_its_own():
+    """A trace that changed strands at the contact, the other strand's halves loose beside it: two whole strands come out."""
+    one, other = crossing()
+    middle = len(one) // 2
+    hopped = np.concatenate([one[:middle], other[middle:]])
+    chains, rooted, _, _ = joined([hopped, other[: middle - 6], one[middle + 6 :]], [one, other], rooted=[0, 1])
+    whole = np.flatnonzero(chains.lengths() > 50.0)
+    assert len(whole) == 2 and rooted[whole].all()
+    # none of the loose ends is left
+    assert len(chains) == 2
+
+
+def test_a_curl_that_turns_over_at_once_is_cut_there():
+    angle = np.linspace(0, 3.0, 160)
+    arc = 6.0 * np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.3 * angle], axis=1)
+    over = arc[-1] + (arc[-1] - arc[::-1])  # bends the other way from its end on
+    pieces = cut_segments(Strands.from_polylines([np.concatenate([arc, over[1:]])]), SPACING)
+    assert len(pieces.strands) == 2 and pieces.onward.tolist() == [1, -1]
+    np.testing.assert_allclose(pieces.strands.roots[1], arc[-1], atol=1.0)
+    assert len(cut_segments(Strands.from_polylines([arc]), SPACING).strands) == 1
+
+
+def test_pieces_turned_against_each_other_do_not_go_on_in_each_other():
+    x = np.arange(0.0, 40.0, 0.25)[:, None]
+    line, beside = x * [1.0, 0, 0], [20.0, 0.5, 0] + x[:40] * [1.0, 0, 0]
+    pieces = cut_segments(Strands.from_polylines([line, beside]), SPACING)
+    cut = int((pieces.parent == 0).sum())
+    assert cut >= 2 and pieces.onward[:cut].tolist() == [*range(1, cut), -1]
+    back = np.ones(len(pieces.parent), bool)
+    turned = pieces.turned(back)
+    assert turned.onward[:cut].tolist() == [-1, *range(cut - 1)]
+    np.testing.assert_array_equal(turned.strands.roots[1], pieces.strands.tips[1])
+    back[0] = False
+    assert pieces.turned(back).onward[:cut].tolist() == [-1, -1, *range(1, cut - 1)]
+    # the root of the whole is that of its first piece, or the last one's tip
+    assert pieces.ends(np.array([1, 0], np.int8))[:cut].tolist() == [1] + [0] * (cut - 1)
+    assert pieces.ends(np.array([-1, 0], np.int8))[:cut].tolist() == [0] * (cut - 1) + [-1]
+
+
+def test_ends_that_meet_say_whether_they_run_the_same_way():
+    angle = np.linspace(0, 2.0, 200)
+    arc = 20.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    density = render_density(Strands.from_polylines([arc]), SPACING, BLUR)
+    for second, expected in ((arc[105:], 1.0), (arc[:104:-1], -1.0)):
+        pieces = cut_segments(Strands.from_polylines([arc[:95], second]), SPACING)
+        pairs, sign, cost = meeting_ends(pieces, density, SEEN)
+        assert sorted(pairs[0]) == [0, 1] and sign.tolist() == [expected] and cost[0] < 5.0
