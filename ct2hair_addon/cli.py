@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from . import __version__
-from .errors import Cancelled, CT2HairError
+from .errors import Cancelled, CT2HairError, explained
 from .settings import PRESETS, STOPS, Settings, parameters
 
 DONE, REFUSED, WRONG_USAGE, STOPPED = 0, 1, 2, 130
@@ -45,12 +45,14 @@ def main(arguments: Sequence[str]) -> int:
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:
         return chosen.run(chosen)
-    except CT2HairError as error:
-        print(f"ct2hair: error: {error}", file=sys.stderr)
-        return REFUSED
     except (Cancelled, KeyboardInterrupt):
         print("ct2hair: cancelled; finished stages are kept", file=sys.stderr)
         return STOPPED
+    except Exception as error:
+        if (text := explained(error)) is None:
+            raise
+        print(f"ct2hair: error: {text}", file=sys.stderr)
+        return REFUSED
     finally:
         signal.signal(signal.SIGTERM, previous)
 

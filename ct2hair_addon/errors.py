@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 
 class CT2HairError(Exception):
     """A problem with the input or the settings. `str(error)` is one or two plain sentences: what is wrong (file, value,
@@ -26,3 +28,15 @@ class HeadError(CT2HairError):
 
 class Cancelled(Exception):
     """The user stopped the work. Raised by a progress callback, passed through by every stage untouched."""
+
+
+def explained(error: Exception) -> str | None:
+    """What to tell the user of an error that stands for a state of the machine and not for a fault of the program, or None."""
+    if isinstance(error, CT2HairError | OSError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "not enough memory: close other programs or choose a coarser scan"
+    if isinstance(error, ModuleNotFoundError) and error.name and "ct2hair" not in error.name:
+        package = error.name.partition(".")[0]
+        return f"the package '{package}' is missing from {sys.executable}: install it there, or let another Python do the work"
+    return None

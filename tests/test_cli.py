@@ -1,6 +1,7 @@
 """The command line: options made from the settings, conversions, clear errors and exit codes."""
 
 import json
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -139,3 +140,17 @@ def test_a_batch_of_nothing_is_refused(tmp_path, capsys, text, message):
     (tmp_path / "jobs.json").write_text(text)
     assert main(["batch", str(tmp_path / "jobs.json"), "--out", str(tmp_path / "out")]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_a_missing_package_and_a_full_disk_are_said_in_a_line(monkeypatch, capsys):
+    for error, said in (
+        (ModuleNotFoundError("No module named 'SimpleITK'", name="SimpleITK"), "the package 'SimpleITK' is missing"),
+        (OSError(28, "No space left on device", "scan.vdb"), "No space left on device: 'scan.vdb'"),
+        (MemoryError(), "not enough memory"),
+    ):
+        monkeypatch.setattr(cli, "_convert", Mock(side_effect=error))
+        assert cli.main(["convert", "a.npz", "b.data"]) == cli.REFUSED
+        assert said in capsys.readouterr().err
+    monkeypatch.setattr(cli, "_convert", Mock(side_effect=KeyError("a fault of ours")))
+    with pytest.raises(KeyError):
+        cli.main(["convert", "a.npz", "b.data"])

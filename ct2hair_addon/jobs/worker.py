@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from ..errors import Cancelled, CT2HairError
+from ..errors import Cancelled, explained
 from .folder import JobFolder
 from .messages import ERROR, KINDS, PROGRESS, RESULT, STATUS, WARNING, Message
 
@@ -53,16 +53,13 @@ def main(job: str) -> int:
     except Cancelled:
         say(Message(ERROR, {"text": "cancelled; the finished stages are kept", "log": str(folder.log), "cancelled": True}))
         return STOPPED
-    except (CT2HairError, MemoryError, OSError) as error:
-        traceback.print_exc()
-        text = str(error) or "not enough memory: close other programs or choose a coarser scan"
-        say(Message(ERROR, {"text": text, "log": str(folder.log), "cancelled": False}))
-        return FAILED
     except Exception as error:
         traceback.print_exc()
-        text = f"unforeseen {type(error).__name__}: {error}"
+        text = explained(error)
+        known = text is not None
+        text = text if known else f"unforeseen {type(error).__name__}: {error}"
         say(Message(ERROR, {"text": text, "log": str(folder.log), "cancelled": False}))
-        return CRASHED
+        return FAILED if known else CRASHED
 
 
 def _protect_stdout(folder: JobFolder) -> Callable[[Message], None]:
