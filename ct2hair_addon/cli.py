@@ -41,7 +41,7 @@ _TYPES = {"float": float, "int": int, "str": str}
 def main(arguments: Sequence[str]) -> int:
     """Run one command; returns the exit code. Errors go to standard error as one readable line."""
     parser = _parser()
-    chosen = parser.parse_args(arguments)
+    chosen = parser.parse_args(_with_axes(arguments))
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:
         return chosen.run(chosen)
@@ -55,6 +55,17 @@ def main(arguments: Sequence[str]) -> int:
         return REFUSED
     finally:
         signal.signal(signal.SIGTERM, previous)
+
+
+def _with_axes(arguments: Sequence[str]) -> list[str]:
+    """The arguments with `--face -y` as `--face=-y`, since argparse takes what begins with a dash for an option."""
+    out: list[str] = []
+    for argument in arguments:
+        if argument in ("-x", "-y", "-z") and out and out[-1].startswith("--") and "=" not in out[-1]:
+            out[-1] += f"={argument}"
+        else:
+            out.append(argument)
+    return out
 
 
 def _interrupt(*_) -> None:

@@ -154,3 +154,9 @@ def test_a_missing_package_and_a_full_disk_are_said_in_a_line(monkeypatch, capsy
     monkeypatch.setattr(cli, "_convert", Mock(side_effect=KeyError("a fault of ours")))
     with pytest.raises(KeyError):
         cli.main(["convert", "a.npz", "b.data"])
+
+
+@pytest.mark.parametrize("written", [["--face", "-y", "--up", "+z"], ["--face=-y", "--up=+z"]])
+def test_an_axis_may_begin_with_a_dash(written, tmp_path, capsys):
+    assert cli.main(["reconstruct", str(tmp_path / "absent.vdb"), "--out", str(tmp_path / "out"), *written]) == cli.REFUSED
+    assert "absent.vdb" in capsys.readouterr().err
