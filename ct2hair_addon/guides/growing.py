@@ -66,11 +66,12 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
                 bodies.append(body)
             reached[fresh] = True
             current = Strands.from_polylines(bodies)
-    pieces = []
-    for n in range(count):
-        own = strands.points[strands.offsets[n] : strands.offsets[n + 1]]
-        pieces.append(own if parts[n] is None else np.concatenate([parts[n], own]))
-    out = Strands.from_polylines(pieces) if count else strands
+    put = [part for part in parts if part is not None]
+    counts = np.zeros(count, np.int64)
+    counts[[n for n, part in enumerate(parts) if part is not None]] = [len(part) for part in put]
+    before = np.concatenate(put) if put else np.zeros((0, 3), np.float32)
+    points = _joined(before.astype(np.float32), offsets_from_counts(counts), strands.points, strands.offsets)
+    out = Strands(points, offsets_from_counts(counts + strands.counts))
     return out.with_attributes(**strands.strand_attributes), reached, grown
 
 
