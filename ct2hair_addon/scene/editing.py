@@ -139,7 +139,8 @@ def trim(result: HairResult, length: float, region: str = "all") -> int:
 def regrow(result: HairResult, region: str = "all", count: int = 0, seed: int = 1, progress: Progress = silent) -> int:
     """Grow the hair of a region anew from the guides, `count` strands (0: as many as there are); returns how many grew.
 
-    Another seed puts the roots elsewhere. What the scan did not show is blended from the guides, not fitted to the scan.
+    Another seed puts the roots elsewhere. What the scan did not show is blended from the guides, not fitted to the scan; by
+    cosines where Blender's own Python has no torch for the learned prior (the worker may have another).
     Raises CT2HairError where the result has no guides.
     """
     if result.guides is None:
@@ -153,7 +154,7 @@ def regrow(result: HairResult, region: str = "all", count: int = 0, seed: int = 
         raise CT2HairError(f"the scalp has nothing in the region '{region}'")
     total = max(int(np.ceil(wanted / share * 1.1)), len(guides))
     plain = Strands(guides.points, guides.offsets, _only(guides.strand_attributes, ("root_uv", "support")))
-    grown = fill_scalp(plain, head, total, InterpolationSettings(), seed, progress=progress).strands
+    grown = fill_scalp(plain, head, total, InterpolationSettings(without_prior="linear"), seed, progress=progress).strands
     grown = grown.select(np.flatnonzero(_in_region(result, grown, region))[:wanted])
     if not len(grown):
         raise CT2HairError(f"no strand could be grown in the region '{region}': its guides are too few")
