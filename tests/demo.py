@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-STYLE, STRANDS, SPACING, SEED = "bob", 8000, 0.4, 5
+STYLE, STRANDS, SPACING, SEED = "bob", 4000, 0.56, 5
 MODULE = "bl_ext.user_default.ct2hair"
 
 
