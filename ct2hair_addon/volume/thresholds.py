@@ -46,7 +46,7 @@ BELOW_NOISE = 3.5
 and few of those go on like a line."""
 LINE_DIRECTIONS = 3
 """A line seen along 13 directions goes on in at most this many of them; a sheet in more."""
-LEAST_LENGTH, LEAST_SHARE = 5000.0, 0.2
+LEAST_LENGTH, LEAST_SHARE = 5000.0, 0.08
 """mm of lines needed, and the lines' share of all peaks that are no blobs, for a scan to show hair."""
 PEAK_EVERY = 4.5
 """voxel; a strand shows a peak about that often along its way."""
