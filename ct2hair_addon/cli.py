@@ -171,13 +171,12 @@ def _batch(chosen: argparse.Namespace) -> int:
         try:
             result = pipeline.reconstruct(scan, out, settings(), observer=TerminalObserver())
             outcome |= {"state": "done", "strands": len(result.hair)}
-        except (CT2HairError, MemoryError, OSError) as error:
-            outcome["error"] = str(error) or type(error).__name__
-        except (Cancelled, KeyboardInterrupt):
+        except Cancelled:
             raise
-        except Exception as error:  # a fault of ours in one scan is no reason to leave the others undone
-            traceback.print_exc()
-            outcome["error"] = f"unforeseen {type(error).__name__}: {error}"
+        except Exception as error:  # even a fault of ours in one scan is no reason to leave the others undone
+            outcome["error"] = explained(error) or f"unforeseen {type(error).__name__}: {error}"
+            if explained(error) is None:
+                traceback.print_exc()
         outcome["seconds"] = round(time.monotonic() - begun, 1)
         outcomes.append(outcome)
         chosen.out.mkdir(parents=True, exist_ok=True)

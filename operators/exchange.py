@@ -8,6 +8,7 @@ from bpy_extras.io_utils import ImportHelper
 
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
+from .reporting import reported
 
 ENDINGS = tuple(f".{ending}" for ending in scene.STRAND_FORMATS)
 
@@ -40,6 +41,7 @@ class CT2HAIR_OT_import_hair(bpy.types.Operator, ImportHelper):
         ],
     )
 
+    @reported(CT2HairError, OSError)
     def execute(self, context):
         head = context.scene.ct2hair.head if self.on == "scene" else None
         if self.on == "scene" and head is None:
@@ -47,11 +49,7 @@ class CT2HAIR_OT_import_hair(bpy.types.Operator, ImportHelper):
             return {"CANCELLED"}
         path = Path(bpy.path.abspath(self.filepath))
         colour = context.scene.ct2hair.colour
-        try:
-            result = scene.import_strands(path, unit=self.unit, up=self.up, head=head, colour=colour, context=context)
-        except (CT2HairError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        result = scene.import_strands(path, unit=self.unit, up=self.up, head=head, colour=colour, context=context)
         self.report({"INFO"}, f"Imported {len(result.hair.data.curves)} strands: '{result.collection.name}'")
         return {"FINISHED"}
 

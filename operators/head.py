@@ -6,6 +6,7 @@ from mathutils import Vector
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 from ..ct2hair_addon.scene import ROLE, SCALP_GROUP
+from .reporting import reported
 
 GUIDE = "ct2hair_placed"
 """Custom property of the head that is placed by hand: the name of the scan's empty."""
@@ -18,12 +19,9 @@ class CT2HAIR_OT_add_head(bpy.types.Operator):
     bl_label = "Mannequin Head"
     bl_options = {"REGISTER", "UNDO"}
 
+    @reported(CT2HairError)
     def execute(self, context):
-        try:
-            ob = scene.add_template_head(context=context)
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        ob = scene.add_template_head(context=context)
         for other in context.selected_objects:
             other.select_set(False)
         ob.select_set(True)
@@ -48,12 +46,9 @@ class CT2HAIR_OT_scalp_from_selection(_OfMesh, bpy.types.Operator):
     bl_label = "Scalp from Selection"
     bl_options = {"REGISTER", "UNDO"}
 
+    @reported(CT2HairError)
     def execute(self, context):
-        try:
-            count = scene.mark_scalp_by_selection(context.active_object)
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        count = scene.mark_scalp_by_selection(context.active_object)
         self.report({"INFO"}, f"{count} vertices are the scalp of '{context.active_object.name}': choose it as Head")
         return {"FINISHED"}
 
@@ -89,14 +84,11 @@ class CT2HAIR_OT_place_head(bpy.types.Operator):
             return False
         return True
 
+    @reported(CT2HairError)
     def execute(self, context):
         empty = scan_empty()
-        try:
-            chosen = context.scene.ct2hair.head
-            ob = scene.add_template_head("Head to Place", context=context) if chosen is None else chosen
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        chosen = context.scene.ct2hair.head
+        ob = scene.add_template_head("Head to Place", context=context) if chosen is None else chosen
         volume = next((child for child in empty.children if child.type == "VOLUME"), None)
         if volume is not None:
             corners = [volume.matrix_world @ Vector(corner) for corner in volume.bound_box]
@@ -127,14 +119,11 @@ class CT2HAIR_OT_use_place(bpy.types.Operator):
             return False
         return True
 
+    @reported(CT2HairError)
     def execute(self, context):
         ob = context.active_object
         context.view_layer.update()
-        try:
-            place = scene.placement(bpy.data.objects[ob[GUIDE]], ob)
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        place = scene.placement(bpy.data.objects[ob[GUIDE]], ob)
         context.scene.ct2hair.settings.head.place = place
         ob.hide_set(True)
         self.report({"INFO"}, "The head starts from this place. Clear 'Place' in the panel to find it automatically again")

@@ -18,6 +18,7 @@ from ..ct2hair_addon.volume import Inspection
 from .preferences import preferences, with_machine, worker_options
 from .properties import settings_of
 from .reconstruct import INTERVAL, job_folder
+from .reporting import reported
 from .running import headless, looking, redraw
 
 THRESHOLDS = ("air", "hair", "knots", "solid")
@@ -107,18 +108,15 @@ class CT2HAIR_OT_look(bpy.types.Operator):
             return False
         return True
 
+    @reported(CT2HairError, OSError)
     def execute(self, context):
         properties = context.scene.ct2hair
         self._scan = properties.scan
         path = Path(bpy.path.abspath(self._scan))
         folder = Path(bpy.path.abspath(properties.folder)) if properties.folder else job_folder(path, context)
-        try:
-            settings = settings_of(properties.settings)
-            automatic = settings.changed({f"scan.{name}": 0.0 for name in THRESHOLDS})
-            looking.process = scene.start_inspection(path, folder, automatic, **worker_options(preferences(context)))
-        except (CT2HairError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        settings = settings_of(properties.settings)
+        automatic = settings.changed({f"scan.{name}": 0.0 for name in THRESHOLDS})
+        looking.process = scene.start_inspection(path, folder, automatic, **worker_options(preferences(context)))
         looking.folder = folder
         if headless():
             looking.process.wait()

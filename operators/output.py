@@ -8,6 +8,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
+from .reporting import reported
 
 
 class OfResult:
@@ -108,27 +109,24 @@ class CT2HAIR_OT_export(OfResult, bpy.types.Operator):
         column.prop(self, "strand_unit")
         column.prop(self, "strand_up")
 
+    @reported(CT2HairError, OSError, RuntimeError)
     def execute(self, context):
         formats = tuple(name for name in scene.FORMATS if getattr(self, name))
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         if folder is None or not formats:
             self.report({"ERROR"}, "Nothing to export: choose a folder and at least one format")
             return {"CANCELLED"}
-        try:
-            written = scene.export_all(
-                scene.active_result(context),
-                folder,
-                formats=formats,
-                name=self.name,
-                unit=self.unit,
-                up=self.up,
-                strand_unit=self.strand_unit,
-                strand_up=self.strand_up,
-                frames=(context.scene.frame_start, context.scene.frame_end) if self.animated else None,
-            )
-        except (CT2HairError, OSError, RuntimeError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        written = scene.export_all(
+            scene.active_result(context),
+            folder,
+            formats=formats,
+            name=self.name,
+            unit=self.unit,
+            up=self.up,
+            strand_unit=self.strand_unit,
+            strand_up=self.strand_up,
+            frames=(context.scene.frame_start, context.scene.frame_end) if self.animated else None,
+        )
         self.report({"INFO"}, f"Wrote {', '.join(path.name for path in written.values())} to {folder}")
         return {"FINISHED"}
 
@@ -157,13 +155,10 @@ class CT2HAIR_OT_render(OfResult, bpy.types.Operator, ExportHelper):
     )
     size: IntProperty(name="Size", description="Edge of the picture. Unit: pixels", default=800, min=16, max=8192)
 
+    @reported(CT2HairError, OSError, RuntimeError)
     def execute(self, context):
         path = Path(bpy.path.abspath(self.filepath)).with_suffix(".png")
-        try:
-            scene.render_picture(scene.active_result(context), path, view=self.view, samples=self.samples, size=self.size)
-        except (CT2HairError, OSError, RuntimeError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        scene.render_picture(scene.active_result(context), path, view=self.view, samples=self.samples, size=self.size)
         self.report({"INFO"}, f"Rendered {path}")
         return {"FINISHED"}
 
@@ -187,18 +182,15 @@ class CT2HAIR_OT_turntable(OfResult, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    @reported(CT2HairError, OSError, RuntimeError)
     def execute(self, context):
         if not self.directory:
             self.report({"ERROR"}, "Choose a folder for the pictures")
             return {"CANCELLED"}
         folder = Path(bpy.path.abspath(self.directory))
-        try:
-            pictures = scene.render_turntable(
-                scene.active_result(context), folder, frames=self.frames, samples=self.samples, size=self.size
-            )
-        except (CT2HairError, OSError, RuntimeError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        pictures = scene.render_turntable(
+            scene.active_result(context), folder, frames=self.frames, samples=self.samples, size=self.size
+        )
         self.report({"INFO"}, f"Rendered {len(pictures)} pictures to {folder}")
         return {"FINISHED"}
 

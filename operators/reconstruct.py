@@ -13,6 +13,7 @@ from ..ct2hair_addon.scene import HAIR_COLOURS
 from ..ct2hair_addon.settings import STOPS
 from .preferences import chosen_cache, preferences, with_machine, worker_options
 from .properties import set_settings, settings_of
+from .reporting import reported
 from .running import Request, current, headless, redraw, time_left
 
 LINE = 8
@@ -254,16 +255,13 @@ class CT2HAIR_OT_resume(bpy.types.Operator):
             return False
         return True
 
+    @reported(CT2HairError)
     def execute(self, context):
         properties = context.scene.ct2hair
         if self.discard:
             properties.unfinished = ""
             return {"FINISHED"}
-        try:
-            scan, out, settings, _, _, until = JobFolder(Path(properties.unfinished) / "job").read()
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        scan, out, settings, _, _, until = JobFolder(Path(properties.unfinished) / "job").read()
         properties.scan, properties.folder = str(scan), str(out)
         set_settings(properties.settings, settings)
         return bpy.ops.ct2hair.reconstruct("EXEC_DEFAULT" if headless() else "INVOKE_DEFAULT", until=until or "result")
@@ -368,13 +366,10 @@ class CT2HAIR_OT_load_result(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    @reported(CT2HairError, OSError)
     def execute(self, context):
         folder = Path(bpy.path.abspath(self.directory))
-        try:
-            result = scene.load_result(folder, colour=self.colour, diameter=self.diameter, context=context)
-        except (CT2HairError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        result = scene.load_result(folder, colour=self.colour, diameter=self.diameter, context=context)
         for reason, count in result.tally.items():
             self.report({"INFO"}, f"{count} strands {reason}")
         self.report({"INFO"}, f"Loaded {len(result.hair.data.curves)} strands: '{result.collection.name}'")

@@ -6,6 +6,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 from .output import OfResult
+from .reporting import reported
 
 REGION_ITEMS = [("all", "Whole scalp", "All hair")] + [
     (name, label, f"Hair rooted at the {label.lower()}") for name, label in scene.REGIONS.items()
@@ -37,17 +38,14 @@ class CT2HAIR_OT_show(OfResult, bpy.types.Operator):
     def description(cls, context, properties):
         return {name: text for name, _, text in WHAT}[properties.what]
 
+    @reported(CT2HairError)
     def execute(self, context):
         result = scene.active_result(context)
         wanted = {"hair": result.hair, "confidence": result.hair, "guides": result.guides, "scan": result.volume}[self.what]
         if wanted is None:
             self.report({"ERROR"}, f"The result has no {self.what}: load it from its job's folder again")
             return {"CANCELLED"}
-        try:
-            scene.show_confidence(result, self.what == "confidence")
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        scene.show_confidence(result, self.what == "confidence")
         for ob in (result.hair, result.guides, result.volume):
             if ob is not None and ob.name in context.view_layer.objects:
                 ob.hide_set(ob != wanted, view_layer=context.view_layer)
@@ -62,12 +60,9 @@ class CT2HAIR_OT_measure(OfResult, bpy.types.Operator):
     bl_label = "Measure Regions"
     bl_options = {"REGISTER", "UNDO"}
 
+    @reported(CT2HairError)
     def execute(self, context):
-        try:
-            measured = scene.measure_regions(scene.active_result(context))["all"]
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        measured = scene.measure_regions(scene.active_result(context))["all"]
         self.report({"INFO"}, f"{measured.strands} strands, {measured.density:.0f} a cm², {measured.length:.0f} mm long")
         return {"FINISHED"}
 
@@ -84,12 +79,9 @@ class CT2HAIR_OT_trim(OfResult, bpy.types.Operator):
         name="Length (mm)", description="Longer hair is cut to this. Unit: mm", default=150.0, min=1.0, max=3000.0
     )
 
+    @reported(CT2HairError)
     def execute(self, context):
-        try:
-            count = scene.trim(scene.active_result(context), self.length, self.region)
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        count = scene.trim(scene.active_result(context), self.length, self.region)
         self.report({"INFO"}, f"{count} strands cut to {self.length:.0f} mm")
         return {"FINISHED"}
 
@@ -105,12 +97,9 @@ class CT2HAIR_OT_regrow(OfResult, bpy.types.Operator):
     count: IntProperty(name="Strands", description="Strands to grow; 0 grows as many as there are", default=0, min=0)
     seed: IntProperty(name="Seed", description="Another seed grows other strands", default=1, min=0)
 
+    @reported(CT2HairError)
     def execute(self, context):
-        try:
-            count = scene.regrow(scene.active_result(context), self.region, self.count, self.seed)
-        except CT2HairError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        count = scene.regrow(scene.active_result(context), self.region, self.count, self.seed)
         self.report({"INFO"}, f"{count} strands grown anew")
         return {"FINISHED"}
 

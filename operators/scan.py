@@ -9,6 +9,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 from .properties import settings_of
+from .reporting import reported
 
 EXTENSIONS = (".vdb", ".npy", ".raw", ".tif", ".tiff", ".nii", ".gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
@@ -38,6 +39,7 @@ class CT2HAIR_OT_import_scan(bpy.types.Operator, ImportHelper):
             layout.prop(context.scene.ct2hair.settings.scan, "raw_shape")
             layout.prop(context.scene.ct2hair.settings.scan, "raw_type")
 
+    @reported(CT2HairError, OSError)
     def execute(self, context):
         properties = context.scene.ct2hair
         path = Path(bpy.path.abspath(self.filepath or self.directory))
@@ -52,9 +54,6 @@ class CT2HAIR_OT_import_scan(bpy.types.Operator, ImportHelper):
                 context=context,
                 progress=lambda done, total: window_manager.progress_update(100 * done / total),
             )
-        except (CT2HairError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
         finally:
             window_manager.progress_end()
         properties.scan = str(path)

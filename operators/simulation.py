@@ -6,6 +6,7 @@ from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 from .output import OfResult
 from .properties import simulation_settings_of
+from .reporting import reported
 
 
 class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):
@@ -20,6 +21,7 @@ class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):
         name="Cache", description="File that the motion is kept in; empty takes the job's folder", subtype="FILE_PATH"
     )
 
+    @reported(CT2HairError, OSError)
     def execute(self, context):
         owner = context.scene
         result = scene.active_result(context)
@@ -35,9 +37,6 @@ class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):
                 cache=cache,
                 progress=lambda done, total: window_manager.progress_update(100 * done / total),
             )
-        except (CT2HairError, OSError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
         finally:
             window_manager.progress_end()
         self.report(

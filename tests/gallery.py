@@ -8,10 +8,11 @@ Pictures of the styles named (all by default) are made anew; the page is written
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 from pathlib import Path
+
+from demo import quietly
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -69,21 +70,6 @@ def render(name: str, options: argparse.Namespace) -> None:
     # 256 colours are a third of the bytes and look the same
     small = Image.fromarray(np.concatenate(pictures, axis=1)).quantize(256)
     small.save(OUT / f"{name}.png", optimize=True)
-
-
-def quietly(work):
-    """Run `work` with Blender's own chatter on standard output, a line a sample, sent to nowhere."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
-    try:
-        return work()
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
 
 
 def page(strands: int) -> str:

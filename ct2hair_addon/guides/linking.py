@@ -329,8 +329,8 @@ def _candidates(
             if not len(tips):
                 continue
             pairs = []
-            for number_of, (ahead, radius) in enumerate(STATIONS):
-                if number_of == NEAR_STATIONS:
+            for station, (ahead, radius) in enumerate(STATIONS):
+                if station == NEAR_STATIONS:
                     tips = tips[onward[tips] < 0]
                 for bent in (0.0, 0.5):
                     centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]

@@ -140,12 +140,12 @@ class Blending:
         self._aligned = coder.in_phase and settings.phase == "aligned"
         self._swing = swing_share(shapes) if self._aligned else None
         self._drawn = settings.method == "texture"
-        self._tree = cKDTree(self._places(uv))
+        self._tree = cKDTree(self._measured(uv))
         # What a lossy code doesn't hold (more turns than it knows) is blended by cosines, lest it be flattened.
         self.held = self._held() if coder.lossy and not self._drawn else np.ones(len(shapes), bool)
         self._instead = None if self.held.all() else Blending(shapes, uv, LinearCoder(coder.points), settings)
 
-    def _places(self, uv: np.ndarray) -> np.ndarray:
+    def _measured(self, uv: np.ndarray) -> np.ndarray:
         """Where distances are taken: on the texture, by the paper's way between whole texels."""
         return texels_of(uv, self._settings.texture or SIDE) if self._drawn else uv
 
@@ -163,7 +163,7 @@ class Blending:
     def at(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(M, P, 3) float32 mm, strands in the frames of the places `uv` (M, 2), and the weights (M, k) of the guides."""
         neighbours = min(self._settings.neighbours, len(self._shapes))
-        distance, near = (found.reshape(len(uv), -1) for found in self._tree.query(self._places(uv), k=neighbours))
+        distance, near = (found.reshape(len(uv), -1) for found in self._tree.query(self._measured(uv), k=neighbours))
         codes = self._codes[near]
         if self._drawn:
             weights = eq3_weights(distance, near, self._codes)
