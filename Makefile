@@ -21,8 +21,9 @@ endif
 demo: setup
 	$(RUN) tests/demo.py out/demo
 
+## all tests, a file at a time on each of up to four cores
 test: setup
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 ## the extension in a real window under Xvfb (Debian sid's Blender in out/gui/debian; root and debootstrap); pictures in out/gui
 test-gui: setup

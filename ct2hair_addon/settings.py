@@ -164,9 +164,19 @@ class RefinementSettings:
         True, "volume: strands and tips that explain nothing of the scan go, so that the scan tells how many there are"
     )
     coarsest: float = parameter(
-        0.5, "volume: largest voxel of the coarse-to-fine search: how far strands are drawn", unit="mm", low=0.01, high=20.0
+        1.0,
+        "volume: largest voxel of the coarse-to-fine search, in the scan's: how far strands are drawn; 1 takes the scan alone",
+        unit="voxel",
+        low=1.0,
+        high=64.0,
     )
-    stiffness: float = parameter(1.0, "volume: shape is kept below about six times this length", unit="mm", low=0.0, high=100.0)
+    stiffness: float = parameter(
+        2.5,
+        "volume: shape is kept below about six times this length, in tight curls; in smooth hair up to three times as far",
+        unit="voxel",
+        low=0.0,
+        high=100.0,
+    )
     rate: float = parameter(0.1, "chamfer: learning rate of Adam", unit="mm", low=1e-4, high=10.0)
     batch: int = parameter(1600, "chamfer: neighbouring strands optimised together", low=1, high=100_000)
     targets: int = parameter(16, "chamfer: nearest points of the scan per strand point (k_o)", low=1, high=64)

@@ -1,4 +1,4 @@
-"""Operators for the head: add the mannequin, mark a scalp, place the head in the scan by hand."""
+"""Operators for the head: add the mannequin, mark a scalp, place the head in the scan by hand or by landmarks."""
 
 import bpy
 from mathutils import Vector
@@ -104,28 +104,71 @@ class CT2HAIR_OT_place_head(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class CT2HAIR_OT_use_place(bpy.types.Operator):
+class _OfPlacedHead:
+    @classmethod
+    def poll(cls, context):
+        ob = placed_head(context)
+        if ob is None or bpy.data.objects.get(ob[GUIDE]) is None:
+            cls.poll_message_set("Make the head that Place by Hand put into the scan the active object")
+            return False
+        return True
+
+
+class CT2HAIR_OT_add_landmarks(_OfPlacedHead, bpy.types.Operator):
+    """Add named balls on the placed head's scalp (hairline, crown, nape, sides): drag each to where it is in the wig"""
+
+    bl_idname = "ct2hair.add_landmarks"
+    bl_label = "Add Landmarks"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @reported(CT2HairError)
+    def execute(self, context):
+        made = scene.add_landmarks(placed_head(context), context)
+        for other in context.selected_objects:
+            other.select_set(False)
+        made[0].select_set(True)
+        context.view_layer.objects.active = made[0]
+        self.report(
+            {"INFO"}, f"Drag the {len(made)} landmarks to their places in the wig (delete what you can't see), then fit"
+        )
+        return {"FINISHED"}
+
+
+class CT2HAIR_OT_fit_landmarks(_OfPlacedHead, bpy.types.Operator):
+    """Move, turn and scale the head so that its landmarks come to where you dragged them"""
+
+    bl_idname = "ct2hair.fit_landmarks"
+    bl_label = "Fit to Landmarks"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @reported(CT2HairError)
+    def execute(self, context):
+        ob = placed_head(context)
+        context.view_layer.update()
+        left = scene.fit_to_landmarks(ob)
+        for other in context.selected_objects:
+            other.select_set(False)
+        ob.select_set(True)
+        context.view_layer.objects.active = ob
+        self.report({"INFO"}, f"'{ob.name}' fits its landmarks to {left:.1f} mm. Press Use This Place when it looks right")
+        return {"FINISHED"}
+
+
+class CT2HAIR_OT_use_place(_OfPlacedHead, bpy.types.Operator):
     """Take the place of the active head for the reconstruction, which then only refines it"""
 
     bl_idname = "ct2hair.use_place"
     bl_label = "Use This Place"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context):
-        ob = context.active_object
-        if ob is None or GUIDE not in ob or bpy.data.objects.get(ob[GUIDE]) is None:
-            cls.poll_message_set("Make the head that Place by Hand put into the scan the active object")
-            return False
-        return True
-
     @reported(CT2HairError)
     def execute(self, context):
-        ob = context.active_object
+        ob = placed_head(context)
         context.view_layer.update()
         place = scene.placement(bpy.data.objects[ob[GUIDE]], ob)
         context.scene.ct2hair.settings.head.place = place
-        ob.hide_set(True)
+        for other in (ob, *scene.landmarks_of(ob)):
+            other.hide_set(True)
         self.report({"INFO"}, "The head starts from this place. Clear 'Place' in the panel to find it automatically again")
         return {"FINISHED"}
 
@@ -149,6 +192,13 @@ class CT2HAIR_OT_forget_place(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def placed_head(context):
+    """The head that is placed by hand: the active object, or the head of the landmark that is; None where it is neither."""
+    ob = context.active_object
+    ob = ob.get(scene.LANDMARK_OF, ob) if ob is not None else None
+    return ob if ob is not None and GUIDE in ob else None
+
+
 def scan_empty():
     """The empty that carries the newest imported scan; None where there is none."""
     for collection in reversed(scene.results("scan")):
@@ -168,6 +218,8 @@ CLASSES = (
     CT2HAIR_OT_scalp_from_selection,
     CT2HAIR_OT_paint_scalp,
     CT2HAIR_OT_place_head,
+    CT2HAIR_OT_add_landmarks,
+    CT2HAIR_OT_fit_landmarks,
     CT2HAIR_OT_use_place,
     CT2HAIR_OT_forget_place,
 )

@@ -174,6 +174,8 @@ class CT2HAIR_OT_reconstruct(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         _hide_scan(request.scan, context)
+        if request.until is not None:
+            collection["ct2hair_scan"] = str(request.scan.resolve())  # to be hidden when more is known
         for warning in job.warnings:
             self.report({"WARNING"}, warning)
         _forget_unfinished(request)

@@ -10,6 +10,7 @@ from ..ct2hair_addon import scene
 from ..ct2hair_addon.errors import CT2HairError
 from .properties import settings_of
 from .reporting import reported
+from .running import headless
 
 EXTENSIONS = (".vdb", ".npy", ".raw", ".tif", ".tiff", ".nii", ".gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 
@@ -45,6 +46,8 @@ class CT2HAIR_OT_import_scan(bpy.types.Operator, ImportHelper):
         path = Path(bpy.path.abspath(self.filepath or self.directory))
         if path.is_file() and (self.whole_folder or path.suffix.lower() == ".dcm"):
             path = path.parent
+        if path.suffix.lower() != ".vdb" and path.exists() and not headless():
+            return self._in_background(properties, path)
         window_manager = context.window_manager
         window_manager.progress_begin(0, 100)
         try:
@@ -61,6 +64,17 @@ class CT2HAIR_OT_import_scan(bpy.types.Operator, ImportHelper):
             self.report({"WARNING"}, warning)
         self.report({"INFO"}, f"Imported {path.name} as '{imported.collection.name}'")
         return {"FINISHED"}
+
+    def _in_background(self, properties, path):
+        """Have the worker read it, which takes long: the job's first stage, that a reconstruction then goes on from."""
+        if not bpy.ops.ct2hair.reconstruct.poll():
+            self.report({"ERROR"}, "Too many jobs wait in line: wait for one of them, or cancel it")
+            return {"CANCELLED"}
+        properties.scan = str(path)
+        outcome = bpy.ops.ct2hair.reconstruct("INVOKE_DEFAULT", scan=str(path), until="scan")
+        if "CANCELLED" not in outcome:
+            self.report({"INFO"}, f"{path.name} is being read; it appears when it is through (ESC: cancel)")
+        return {"CANCELLED"} if "CANCELLED" in outcome else {"FINISHED"}
 
 
 class CT2HAIR_FH_scan(bpy.types.FileHandler):

@@ -146,9 +146,11 @@ class CT2HAIR_PT_head(_Sidebar, bpy.types.Panel):
         else:
             column.prop(head, "face")
             column.prop(head, "up")
+            column.operator("ct2hair.place_head", icon="ORIENTATION_LOCAL")
             row = column.row(align=True)
-            row.operator("ct2hair.place_head", icon="ORIENTATION_LOCAL")
-            row.operator("ct2hair.use_place", icon="CHECKMARK")
+            row.operator("ct2hair.add_landmarks", icon="EMPTY_AXIS")
+            row.operator("ct2hair.fit_landmarks", icon="SNAP_ON")
+            column.operator("ct2hair.use_place", icon="CHECKMARK")
         column.prop(head, "net_clearance")
 
 

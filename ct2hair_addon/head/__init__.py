@@ -3,6 +3,7 @@
 from .flatten import Distortion, distortion, unwrap
 from .form import HeadForm, template_head
 from .hairnet import remove_hairnet
+from .landmarks import fit_landmarks, scalp_landmarks
 from .marking import mark_scalp
 from .mesh import HeadMesh
 from .obj import load_obj
@@ -19,11 +20,13 @@ __all__ = [
     "ScalpPoints",
     "ScalpSurface",
     "distortion",
+    "fit_landmarks",
     "fit_to_roots",
     "load_obj",
     "mark_scalp",
     "register_head",
     "remove_hairnet",
+    "scalp_landmarks",
     "scalp_surface",
     "template_head",
     "unwrap",

@@ -12,9 +12,11 @@ import numpy as np
 
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
+from ..strands import Strands
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
+from .curves import eased, easing_lengths, mean_curvature, segment_lengths
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -28,6 +30,10 @@ FRICTION = 0.5
 STEP_LIMIT = 0.5
 """Longest move in one iteration, voxels: within the reach of the potential that it follows."""
 LENGTH_SWEEPS = 4
+STIFF_TURN = 0.075
+"""Radians that a strand turns over the length that its shape is kept below."""
+SMOOTH_HAIR = 2.0
+"""How much longer than `stiffness` that length may be where hair bends little: its short waves are noise and hops."""
 PLANES_EVERY = 10
 """Iterations after which the head's tangent planes are taken anew; a point moves a few voxels at most in between."""
 
@@ -41,9 +47,9 @@ class Level:
 
 
 def pyramid(density: BrickVolume, blur: float, coarsest: float) -> list[Level]:
-    """The scan at its own voxel size, twice that, and so on up to `coarsest` mm; coarsest first."""
+    """The scan at its own voxel size, twice that, and so on up to `coarsest` times; coarsest first."""
     levels = [Level(density, blur)]
-    while 2.0 * levels[-1].scan.spacing <= 1.1 * coarsest:
+    while 2.0 * levels[-1].scan.spacing <= coarsest * density.spacing:
         coarse = halved(levels[-1].scan)
         kept = np.sqrt((levels[-1].blur / 2.0) ** 2 + HALVING_VARIANCE)
         extra = np.sqrt(max(LEVEL_BLUR**2 - kept**2, 0.0))
@@ -72,6 +78,9 @@ def fit_to_volume(
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
     points = np.array(points, np.float64)
+    strands = Strands(points.astype(np.float32), offsets)
+    bends = STIFF_TURN / np.maximum(mean_curvature(strands, density.spacing), 1e-6)
+    noise = easing_lengths(strands, density.spacing)
     rest_lengths = segment_lengths(points, offsets)
     levels = pyramid(density, profile.blur, settings.coarsest)
     plan = shares(settings.iterations, len(levels))
@@ -81,7 +90,7 @@ def fit_to_volume(
     for number, (level, count) in enumerate(zip(levels, plan, strict=True)):
         stage = part(progress, done[number], done[number + 1])
         size = level.scan.spacing
-        stiffness = max(settings.stiffness, 2.0 * size)
+        stiffness = np.clip(bends, settings.stiffness * size, SMOOTH_HAIR * settings.stiffness * size)
         gain = profile.line_mass / size**2
         newton = 8.0 * np.pi * level.blur**4 / gain
         residual, potential = np.empty_like(level.scan.bricks), np.empty_like(level.scan.bricks)
@@ -90,6 +99,9 @@ def fit_to_volume(
         rest = points.copy()
         for iteration in range(count):
             step = part(stage, iteration / count, (iteration + 1) / count)
+            if level is levels[-1] and iteration == count // 2:
+                points = eased(points, offsets, noise, size)
+                rest, velocity, rest_lengths = points.copy(), np.zeros_like(points), segment_lengths(points, offsets)
             if iteration % PLANES_EVERY == 0:
                 visible = boundary.look(points)
             voxels = level.scan.to_voxel(points)
@@ -110,14 +122,6 @@ def fit_to_volume(
         tally["iterations"] = tally.get("iterations", 0) + count
     progress(1.0, 1.0)
     return points, tally
-
-
-def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(M,) the distance from each point to the next of its strand; 0 at tips."""
-    lengths = np.zeros(len(points))
-    lengths[:-1] = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    lengths[offsets[1:][np.diff(offsets) > 0] - 1] = 0.0
-    return lengths
 
 
 def _scale(scan: BrickVolume) -> float:

@@ -105,7 +105,7 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
 
     Solves, per strand and axis, (w + a K) d = rate * w * force - a K (points - rest), K = D2' D2 (second differences),
     a = (stiffness / segment length)^4; then velocity = friction * velocity + d, cut to `limit`, moves the points.
-    stiffness, limit and lengths in the unit of `points`.
+    stiffness (N,), limit and lengths in the unit of `points`.
     """
     for n in numba.prange(len(offsets) - 1):
         start, size = offsets[n], offsets[n + 1] - offsets[n]
@@ -118,7 +118,7 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
             )
         step = max(length / (size - 1), 1e-6)
         # A band at most so stiff that float64 still resolves the data beside it.
-        a = min((stiffness / step) ** 4, 1e8)
+        a = min((stiffness[n] / step) ** 4, 1e8)
         diagonal, one, two = np.zeros(size), np.zeros(size), np.zeros(size)
         right = np.zeros((size, 3))
         for i in range(size):

@@ -13,12 +13,14 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import control_points, polylines
+from .curves import control_points, eased, easing_lengths, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
 MISPLACED = 2.0
 """voxel; strands may be off by so much before they are fitted, and are not held to be wrong for it."""
+SETTLED = 15
+"""Iterations after which strands are where they belong."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ def refine(
     tally["pieces of lone strands measured"] = profile.pieces
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
-    points, offsets = control_points(kept, settings.points)
+    eases = settings.iterations and settings.method == "volume"
+    points, offsets = control_points(_eased(kept, density.spacing) if eases else kept, settings.points)
     first = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
@@ -77,7 +80,14 @@ def refine(
         tally |= counts
         if judged:
             points, offsets, kept, counts = _pruned(
-                points, offsets, kept, density, profile, boundary, part(progress, 0.85, 0.9)
+                points,
+                offsets,
+                kept,
+                density,
+                profile,
+                boundary,
+                part(progress, 0.85, 0.9),
+                0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
     last = (Strands(points, offsets), boundary.look(points))
@@ -89,6 +99,13 @@ def refine(
     result = _supported(Strands(cleared, fine_offsets, kept.strand_attributes), density, hair_level)
     progress(1.0, 1.0)
     return Refined(result, tally, {"before": before, "after": after})
+
+
+def _eased(strands: Strands, voxel: float) -> Strands:
+    """The strands, points a voxel (mm) apart, without the noise of tracing."""
+    even = strands.resampled_by_step(voxel)
+    points = eased(even.points, even.offsets, easing_lengths(strands, voxel), voxel)
+    return Strands(points.astype(np.float32), even.offsets)
 
 
 def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):

@@ -21,6 +21,7 @@ from .head import SCALP_GROUP, SCALP_UV, add_scalp_uv, head_mesh, new_head, save
 from .looks import histogram_picture, slice_picture, threshold_values
 from .materials import DENSITY_PRESETS, HAIR_COLOURS, set_density_colours, set_hair_colour
 from .picture import render_picture, render_turntable
+from .placing import LANDMARK_OF, add_landmarks, fit_to_landmarks, landmarks_of, placement
 from .results import ROLE, HairResult, ScanResult, active_result, result_of, results
 from .session import (
     FORMATS,
@@ -34,7 +35,6 @@ from .session import (
     import_strands,
     load_result,
     load_stage,
-    placement,
     reconstruct,
     scan_name,
     show_strands,
@@ -49,6 +49,7 @@ __all__ = [
     "DENSITY_PRESETS",
     "FORMATS",
     "HAIR_COLOURS",
+    "LANDMARK_OF",
     "MM",
     "REGIONS",
     "ROLE",
@@ -64,6 +65,7 @@ __all__ = [
     "ScanResult",
     "SimulationResult",
     "active_result",
+    "add_landmarks",
     "add_scalp_uv",
     "add_template_head",
     "check_job",
@@ -71,12 +73,14 @@ __all__ = [
     "confidence_shown",
     "default_folder",
     "export_all",
+    "fit_to_landmarks",
     "full_width_factor",
     "head_from_scan",
     "head_mesh",
     "histogram_picture",
     "import_scan",
     "import_strands",
+    "landmarks_of",
     "load_result",
     "load_stage",
     "mark_scalp_by_selection",

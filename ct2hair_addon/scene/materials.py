@@ -1,10 +1,11 @@
-"""The materials of a result: Principled Hair by melanin, a mannequin's skin, and the scan's density as a cloud."""
+"""The materials of a result: hair by melanin, a mannequin's skin, and the scan's density as a cloud."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import bpy
+import numpy as np
 
 from .staging import NewData
 
@@ -35,38 +36,128 @@ HAIR_COLOURS: dict[str, HairColour] = {
 """Hair colours by name, from measured amounts of eumelanin and pheomelanin put on Principled Hair's scale."""
 
 
+HAIR_GROUP = "CT2Hair Strand"
+"""Name of the node group that all hair materials share."""
+HAIR_INPUTS = {
+    "Melanin": 0.74,
+    "Melanin Redness": 0.55,
+    "Tint": (1.0, 1.0, 1.0, 1.0),
+    "Roughness": 0.28,
+    "Radial Roughness": 0.35,
+    "Random Color": 0.25,
+    "Random Roughness": 0.15,
+}
+"""Inputs of the group, each 0 to 1, and what they are for brown hair."""
+SEEN = ((0.02, 0.012, 0.008), (0.77, 0.692, 0.408), (0.77, 0.392, 0.408))
+"""Linear RGB of much hair together: without light through it, fair, and fair and red; by eye after Cycles' pictures."""
+FACTOR, FIRST, SECOND, MIXED = 0, 6, 7, 2
+"""Sockets of a Mix node for colours, which share their names with those for numbers."""
+
+
 def hair_material(new: NewData, name: str, colour: str = "brown") -> bpy.types.Material:
-    """A Principled Hair material in one of `HAIR_COLOURS`; every strand a little different."""
+    """Hair in one of `HAIR_COLOURS`, every strand a little different.
+
+    Principled Hair in Cycles; in EEVEE, where light doesn't pass through strands, and in exports (USD's preview surface) a
+    surface of the colour that much hair has together. Both follow the inputs of the node `Hair` (`HAIR_INPUTS`).
+    """
     material = _material(new, name)
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
-    out = nodes.new("ShaderNodeOutputMaterial")
-    shader = nodes.new("ShaderNodeBsdfHairPrincipled")
-    shader.name = "Hair"
-    shader.model = "CHIANG"
-    shader.parametrization = "MELANIN"
-    info = nodes.new("ShaderNodeHairInfo")
-    links.new(info.outputs["Random"], shader.inputs["Random"])
-    links.new(shader.outputs["BSDF"], out.inputs["Surface"])
-    _place(nodes, [info], [shader], [out])
+    strand = nodes.new("ShaderNodeGroup")
+    strand.name = strand.label = "Hair"
+    strand.node_tree = _hair_group(new)
+    surface = nodes.new("ShaderNodeBsdfPrincipled")
+    surface.name = "Surface"
+    surface.inputs["Specular IOR Level"].default_value = 0.35
+    traced, drawn = (nodes.new("ShaderNodeOutputMaterial") for _ in range(2))
+    traced.target, drawn.target = "CYCLES", "EEVEE"
+    links.new(strand.outputs["BSDF"], traced.inputs["Surface"])
+    links.new(strand.outputs["Color"], surface.inputs["Base Color"])
+    links.new(strand.outputs["Roughness"], surface.inputs["Roughness"])
+    links.new(surface.outputs["BSDF"], drawn.inputs["Surface"])
+    _place(nodes, [strand], [surface], [traced, drawn])
     set_hair_colour(material, colour)
     return material
 
 
 def set_hair_colour(material: bpy.types.Material, colour: str) -> None:
     """Set a material of `hair_material` to one of `HAIR_COLOURS`. KeyError for an unknown name or another material."""
-    wanted = HAIR_COLOURS[colour]
-    inputs = material.node_tree.nodes["Hair"].inputs
-    inputs["Melanin"].default_value = wanted.melanin
-    inputs["Melanin Redness"].default_value = wanted.redness
-    inputs["Tint"].default_value = (*wanted.tint, 1.0)
-    inputs["Roughness"].default_value = 0.28
-    inputs["Radial Roughness"].default_value = 0.35
-    inputs["Random Color"].default_value = wanted.random
-    inputs["Random Roughness"].default_value = 0.15
-    # the solid view has no hair shader: show what the pigment looks like there
+    wanted, nodes = HAIR_COLOURS[colour], material.node_tree.nodes
+    pigment = {
+        "Melanin": wanted.melanin,
+        "Melanin Redness": wanted.redness,
+        "Tint": (*wanted.tint, 1.0),
+        "Random Color": wanted.random,
+    }
+    for name, value in {**HAIR_INPUTS, **pigment}.items():
+        nodes["Hair"].inputs[name].default_value = value
+    # what has no hair shader, the solid view and other programs, shows what the pigment looks like
+    dark, fair, red = np.array(SEEN)
     light = (1.0 - wanted.melanin) ** 1.5
-    material.diffuse_color = (0.02 + 0.75 * light, 0.012 + (0.68 - 0.3 * wanted.redness) * light, 0.008 + 0.4 * light, 1.0)
+    seen = dark + light * (fair + wanted.redness * (red - fair) - dark)
+    material.diffuse_color = (*seen, 1.0)
+    if "Surface" in nodes:  # files of earlier versions have none
+        nodes["Surface"].inputs["Base Color"].default_value = material.diffuse_color
+        nodes["Surface"].inputs["Roughness"].default_value = 0.4
+
+
+def _hair_group(new: NewData) -> bpy.types.NodeTree:
+    """The group `HAIR_GROUP`: from pigment to Principled Hair, and to a colour and a roughness for who has no such shader."""
+    known = bpy.data.node_groups.get(HAIR_GROUP)
+    if known is not None and {item.name for item in known.interface.items_tree} >= {*HAIR_INPUTS, "BSDF", "Color"}:
+        return known
+    group = new.add(bpy.data.node_groups.new(HAIR_GROUP, "ShaderNodeTree"))
+    for name, value in HAIR_INPUTS.items():
+        kind = "NodeSocketFloat" if isinstance(value, float) else "NodeSocketColor"
+        socket = group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+        socket.default_value = value
+        if isinstance(value, float):
+            socket.subtype, socket.min_value, socket.max_value = "FACTOR", 0.0, 1.0
+    for name, kind in (("BSDF", "NodeSocketShader"), ("Color", "NodeSocketColor"), ("Roughness", "NodeSocketFloat")):
+        group.interface.new_socket(name, in_out="OUTPUT", socket_type=kind)
+    nodes, links = group.nodes, group.links
+    given, out = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
+    info = nodes.new("ShaderNodeHairInfo")
+    shader = nodes.new("ShaderNodeBsdfHairPrincipled")
+    shader.model, shader.parametrization = "CHIANG", "MELANIN"
+    for name in HAIR_INPUTS:
+        links.new(given.outputs[name], shader.inputs[name])
+    links.new(info.outputs["Random"], shader.inputs["Random"])
+    links.new(shader.outputs["BSDF"], out.inputs["BSDF"])
+
+    def node(kind: str, **values) -> bpy.types.Node:
+        made = nodes.new(kind)
+        for name, value in values.items():
+            setattr(made, name, value)
+        return made
+
+    fairness, light = node("ShaderNodeMath", operation="SUBTRACT", use_clamp=True), node("ShaderNodeMath", operation="POWER")
+    fairness.inputs[0].default_value, light.inputs[1].default_value = 1.0, 1.5
+    links.new(given.outputs["Melanin"], fairness.inputs[1])
+    links.new(fairness.outputs[0], light.inputs[0])
+    reds, fairs, dyed = (node("ShaderNodeMix", data_type="RGBA") for _ in range(3))
+    dyed.blend_type = "MULTIPLY"
+    dyed.inputs[FACTOR].default_value = 1.0
+    for socket, value in zip((fairs.inputs[FIRST], reds.inputs[FIRST], reds.inputs[SECOND]), SEEN, strict=True):
+        socket.default_value = (*value, 1.0)
+    links.new(given.outputs["Melanin Redness"], reds.inputs[FACTOR])
+    links.new(reds.outputs[MIXED], fairs.inputs[SECOND])
+    links.new(light.outputs[0], fairs.inputs[FACTOR])
+    links.new(fairs.outputs[MIXED], dyed.inputs[FIRST])
+    links.new(given.outputs["Tint"], dyed.inputs[SECOND])
+    spread, shade = node("ShaderNodeMath", operation="MULTIPLY_ADD"), node("ShaderNodeMath", operation="MULTIPLY_ADD")
+    spread.inputs[1].default_value, spread.inputs[2].default_value = 2.0, -1.0
+    shade.inputs[2].default_value = 1.0
+    links.new(info.outputs["Random"], spread.inputs[0])
+    links.new(spread.outputs[0], shade.inputs[0])
+    links.new(given.outputs["Random Color"], shade.inputs[1])
+    tone = nodes.new("ShaderNodeHueSaturation")
+    links.new(dyed.outputs[MIXED], tone.inputs["Color"])
+    links.new(shade.outputs[0], tone.inputs["Value"])
+    links.new(tone.outputs["Color"], out.inputs["Color"])
+    links.new(given.outputs["Roughness"], out.inputs["Roughness"])
+    _place(nodes, [given, info], [fairness, spread, reds], [light, shade], [fairs], [dyed], [tone, shader], [out])
+    return group
 
 
 def support_material(new: NewData, name: str) -> bpy.types.Material:

@@ -32,7 +32,7 @@ from ..settings import Settings
 from ..strand_files import read_strands
 from ..strands import Strands
 from .export import write_alembic, write_blend, write_strand_file, write_usd
-from .frames import MM, head_from_scan, rigid, scene_from_scan, scene_from_unregistered_scan
+from .frames import MM, head_from_scan, scene_from_scan, scene_from_unregistered_scan
 from .hair import DIAMETER, new_hair
 from .head import attach, head_mesh, new_head, save_head
 from .materials import guide_material, hair_material
@@ -333,21 +333,6 @@ def add_template_head(name: str = "CT2Hair Head", context: bpy.types.Context | N
     (context.collection or context.scene.collection).objects.link(ob)
     context.view_layer.update()
     return ob
-
-
-def placement(scan: bpy.types.Object, head: bpy.types.Object) -> str:
-    """The setting `head.place` for a head that the user has put where it stands in a scan: 16 numbers, head to scan, mm.
-
-    scan: the empty of an imported scan (role `scan`). head: the template as it is, moved, turned and scaled evenly.
-    Raises CT2HairError where it is scaled unevenly or mirrored.
-    """
-    matrix = np.linalg.inv(np.array(scan.matrix_world, np.float64)) @ np.array(head.matrix_world, np.float64)
-    matrix = matrix @ np.diag([MM, MM, MM, 1.0])
-    try:
-        rigid(matrix)
-    except ValueError:
-        raise CT2HairError(f"'{head.name}' is scaled unevenly or mirrored: give it one scale for all axes") from None
-    return " ".join(f"{value:.9g}" for value in matrix.ravel())
 
 
 def reconstruct(

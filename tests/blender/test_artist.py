@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from ct2hair_addon import scene
 from ct2hair_addon.errors import CT2HairError
@@ -119,6 +120,8 @@ def test_buttons_without_a_result_say_why():
         ("thresholds", "look at the scan first"),
         ("place_head", "import it first"),
         ("use_place", "Place by Hand"),
+        ("add_landmarks", "Place by Hand"),
+        ("fit_landmarks", "Place by Hand"),
         ("forget_place", "automatically already"),
         ("scalp_from_selection", "active object"),
         ("paint_scalp", "active object"),
@@ -190,6 +193,31 @@ def test_a_head_placed_by_hand_becomes_the_setting(job_folder):
     ob.scale.x = 2.0
     with pytest.raises(RuntimeError, match="unevenly"):
         attempt("use_place")
+
+
+def test_landmarks_that_are_dragged_move_the_head(job_folder):
+    bpy.ops.ct2hair.import_scan(filepath=str(job_folder / "volume.vdb"))
+    assert attempt("place_head") == {"FINISHED"}
+    head = bpy.context.active_object
+    with pytest.raises(RuntimeError, match="no landmarks"):
+        attempt("fit_landmarks")
+    assert attempt("add_landmarks") == {"FINISHED"}
+    empties = scene.landmarks_of(head)
+    assert len(empties) == 5 and bpy.context.active_object in empties
+    wanted = Matrix.Translation((0.02, -0.01, 0.03)) @ Matrix.Rotation(0.4, 4, "Z") @ Matrix.Scale(1.05, 4)
+    for ob in empties:
+        ob.location = wanted @ ob.location
+    bpy.data.objects.remove(empties[0])  # one that can't be seen
+    before = head.matrix_world.copy()
+    assert attempt("fit_landmarks") == {"FINISHED"} and bpy.context.active_object == head
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(np.array(head.matrix_world), np.array(wanted @ before), atol=1e-5)
+    assert attempt("use_place") == {"FINISHED"} and bpy.context.scene.ct2hair.settings.head.place
+    assert all(ob.hide_get() for ob in (head, *scene.landmarks_of(head)))
+    for ob in scene.landmarks_of(head)[1:]:
+        bpy.data.objects.remove(ob)
+    with pytest.raises(RuntimeError, match="at least 3"):
+        attempt("fit_landmarks")
 
 
 # --- looking

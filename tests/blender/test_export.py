@@ -186,6 +186,19 @@ def test_export_all_brings_the_report_along(result, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"hair.blend", "hair.usda", "report.html", "report.json"}
 
 
+def test_usd_hair_has_a_preview_surface_of_its_colour(result, tmp_path):
+    UsdShade = pytest.importorskip("pxr.UsdShade", reason="usd-core is not installed")
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(scene.write_usd(result, tmp_path / "hair.usda")))
+    shaders = [
+        UsdShade.Shader(prim) for prim in stage.Traverse() if prim.IsA(UsdShade.Shader) and "Hair" in str(prim.GetPath())
+    ]
+    surface = next(shader for shader in shaders if shader.GetIdAttr().Get() == "UsdPreviewSurface")
+    colour = result.hair.active_material.diffuse_color[:3]
+    np.testing.assert_allclose(surface.GetInput("diffuseColor").Get(), colour, atol=1e-6)
+
+
 def test_usd_passes_the_validators(result, tmp_path):
     """All validators of usd-core, without an error; materials bound to head, hair and guides."""
     UsdValidation = pytest.importorskip("pxr.UsdValidation", reason="usd-core is not installed")

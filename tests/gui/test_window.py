@@ -109,8 +109,9 @@ def test_a_scan_is_imported_by_clicking(blender, scan):
     time.sleep(1.5)
     picture(blender, "2_import")
     blender.key("Return")
-    blender.until(f"answer = bpy.context.scene.ct2hair.scan == '{HOME}/{scan.name}'", timeout=400, every=2)
-    assert blender.ask("answer = [ob.type for ob in bpy.data.objects].count('VOLUME')") == 1
+    blender.until(f"answer = bpy.context.scene.ct2hair.scan == '{HOME}/{scan.name}'", timeout=60, every=1)
+    # read by the worker: the window answers meanwhile
+    blender.until("answer = [ob.type for ob in bpy.data.objects].count('VOLUME') == 1", timeout=400, every=2)
     blender.ask(
         "window, area, _ = sidebar()\n"
         "region = next(r for r in area.regions if r.type == 'WINDOW')\n"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.refinement.boundary import MARGIN, Boundary
-from ct2hair_addon.refinement.curves import control_points, polylines
-from ct2hair_addon.refinement.fit import pyramid, segment_lengths, shares
+from ct2hair_addon.refinement.curves import control_points, polylines, segment_lengths
+from ct2hair_addon.refinement.fit import pyramid, shares
 from ct2hair_addon.refinement.motion import _solve_band, keep_lengths, stiff_step
 from ct2hair_addon.refinement.splat import render
 from ct2hair_addon.strands import Strands
@@ -41,7 +41,8 @@ def stepped(forces, weights=None, stiffness=3.0, limit=100.0, points=None, frict
     points = rest.copy() if points is None else points
     velocity = np.zeros_like(points)
     weights = np.ones(len(points)) if weights is None else weights
-    stiff_step(points, rest, offsets, forces, weights, stiffness, 1.0, friction, limit, velocity)
+    firm = np.full(len(offsets) - 1, float(stiffness))
+    stiff_step(points, rest, offsets, forces, weights, firm, 1.0, friction, limit, velocity)
     return points, rest
 
 
@@ -145,7 +146,7 @@ def test_the_pyramid_is_coarsest_first_and_each_level_a_rendering_of_its_own_blu
     points = np.linspace([8.0, 20.0, 30.0], [56.0, 44.0, 34.0], 12)
     offsets, visible = np.array([0, 12]), np.ones(12)
     density = BrickVolume(values.table, render(points, offsets, visible, values, 0.85), 0.4, values.origin)
-    levels = pyramid(density, 0.85, 1.6)
+    levels = pyramid(density, 0.85, 4.0)
     assert [level.scan.spacing for level in levels] == pytest.approx([1.6, 0.8, 0.4])
     assert levels[-1].scan is density and levels[-1].blur == 0.85
     for level in levels[:-1]:
