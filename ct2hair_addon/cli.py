@@ -180,7 +180,7 @@ def _batch(chosen: argparse.Namespace) -> int:
         outcome["seconds"] = round(time.monotonic() - begun, 1)
         outcomes.append(outcome)
         chosen.out.mkdir(parents=True, exist_ok=True)
-        (chosen.out / "batch.json").write_text(json.dumps(outcomes, indent=2))
+        (chosen.out / "batch.json").write_text(json.dumps(outcomes, indent=2), encoding="utf-8")
     failed = [outcome for outcome in outcomes if outcome["state"] == "failed"]
     for outcome in outcomes:
         what = outcome["error"] if outcome in failed else f"{outcome['strands']} strands"
@@ -197,7 +197,7 @@ def _batch_jobs(chosen: argparse.Namespace) -> list[tuple[str, Path, Callable[[]
         base = Path()
     else:
         try:
-            entries, base = json.loads(chosen.source.read_text()), chosen.source.parent
+            entries, base = json.loads(chosen.source.read_text(encoding="utf-8")), chosen.source.parent
         except OSError as error:
             raise CT2HairError(f"{chosen.source}: can't be read ({error.strerror}); name a folder or a JSON file") from error
         except ValueError as error:
@@ -279,7 +279,7 @@ def _reconstruct(chosen: argparse.Namespace) -> int:
 def _settings_file(path: Path) -> dict[str, Any]:
     """Dotted names and values of a JSON file of settings."""
     try:
-        nested = json.loads(path.read_text())
+        nested = json.loads(path.read_text(encoding="utf-8"))
         return {f"{stage}.{name}": value for stage, group in nested.items() for name, value in group.items()}
     except OSError as error:
         raise CT2HairError(f"{path}: can't be read ({error.strerror})") from error
@@ -387,7 +387,7 @@ def _evaluate(chosen: argparse.Namespace) -> int:
     head = load_obj(chosen.head) if chosen.head else None
     scores = evaluate(read_strands(chosen.truth), read_strands(chosen.result), head, voxels=tuple(chosen.voxel))
     if chosen.json:
-        chosen.json.write_text(json.dumps(scores, indent=2))
+        chosen.json.write_text(json.dumps(scores, indent=2), encoding="utf-8")
     print(format_scores(scores))
     return DONE
 

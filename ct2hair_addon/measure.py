@@ -15,7 +15,7 @@ class Meter:
     def __init__(self) -> None:
         self._start = time.monotonic()
         try:
-            _CLEAR.write_text("5")  # Linux: forget the peak so far
+            _CLEAR.write_text("5", encoding="utf-8")  # Linux: forget the peak so far
         except OSError:
             pass
 
@@ -27,7 +27,7 @@ class Meter:
     def peak_memory(self) -> float:
         """GB (10^9 bytes) of resident memory at the peak."""
         try:
-            line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
+            line = next(line for line in _STATUS.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM"))
             return int(line.split()[1]) * 1024 / 1e9
         except (OSError, StopIteration):
             return _peak_by_rusage()

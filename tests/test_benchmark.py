@@ -116,7 +116,7 @@ def test_a_tiny_set_ends_with_its_tables_and_goes_on_from_what_it_has(tmp_path, 
     assert "paper: refined" in first.out and "ours: guides" in first.out
     for name in ("quick.md", "quick.json", "quick-iou.svg", "quick-strands.svg"):
         assert (tmp_path / name).stat().st_size > 500
-    values = json.loads((tmp_path / "quick.json").read_text())
+    values = json.loads((tmp_path / "quick.json").read_text(encoding="utf-8"))
     assert {result["label"] for result in values["results"]} == {"ours", "paper"}
     for result in values["results"]:
         assert 0.0 < result["scores"]["refined"]["voxel"]["coarse"]["iou"] <= 1.0
@@ -124,8 +124,8 @@ def test_a_tiny_set_ends_with_its_tables_and_goes_on_from_what_it_has(tmp_path, 
     assert not (tmp_path / "runs").exists()
     # one result is lost, as if the run had been cut off: only that one is made again, and comes out the same
     (lost,) = (tmp_path / "results").glob("*.ours.*.json")
-    before = json.loads(lost.read_text())
+    before = json.loads(lost.read_text(encoding="utf-8"))
     lost.unlink()
     assert cli.main(command) == cli.DONE
-    assert json.loads(lost.read_text())["scores"] == before["scores"]
+    assert json.loads(lost.read_text(encoding="utf-8"))["scores"] == before["scores"]
     assert ".paper: known" in capsys.readouterr().err

@@ -110,7 +110,7 @@ def test_a_batch_goes_on_after_a_failure_and_sums_up(scans, tmp_path, capsys):
     assert all(settings == Settings.preset("draft") for *_, settings in scans.seen)
     told = capsys.readouterr().out
     assert "b: b shows no hair" in told and "2 of 3 done" in told
-    summary = json.loads((tmp_path / "out" / "batch.json").read_text())
+    summary = json.loads((tmp_path / "out" / "batch.json").read_text(encoding="utf-8"))
     assert [entry["state"] for entry in summary] == ["done", "failed", "done"] and summary[0]["strands"] == 7
 
 
@@ -127,7 +127,7 @@ def test_a_batch_file_names_scans_presets_and_settings(scans, tmp_path):
     assert main(["batch", str(path), "--out", str(tmp_path / "out")]) == 1
     assert [out.name for _, out, _ in scans.seen] == ["first", "first_1", "boom"]
     assert scans.seen[0][2] == Settings.preset("final").changed({"guides.step": 0.5})
-    errors = [entry["error"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text())]
+    errors = [entry["error"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text(encoding="utf-8"))]
     assert errors[:2] == ["", ""] and "ZeroDivisionError" in errors[2] and "guides.stride" in errors[3]
     path.write_text(json.dumps(entries[:1]))
     assert main(["batch", str(path), "--out", str(tmp_path / "out")]) == 0

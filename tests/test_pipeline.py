@@ -46,10 +46,10 @@ def test_the_result_folder_holds_what_it_should(result):
         assert support.shape == (len(strands),) and support.min() >= 0 and support.max() <= 1
     assert np.isfinite(hair.points).all() and hair.counts.min() >= 2
     assert len(load_obj(out / "head.obj").vertices) == len(made.head.vertices)
-    report = json.loads((out / "report.json").read_text())
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert [stage["name"] for stage in report["stages"]] == list(pipeline.STAGES)
     assert report["hair"]["strands"] == len(hair)
-    assert "<html" in (out / "report.html").read_text()[:500].lower()
+    assert "<html" in (out / "report.html").read_text(encoding="utf-8")[:500].lower()
     assert (out / "volume.vdb").stat().st_size > 10_000
 
 

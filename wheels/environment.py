@@ -23,7 +23,7 @@ def make(folder: Path, torch: str) -> None:
     """Make or bring up to date an environment for the Python that runs this; `torch` is "any", "cpu" or "none"."""
     stamp = folder / STAMP
     made_from = hashlib.sha256(LOCK.read_bytes() + PINS.read_bytes() + torch.encode()).hexdigest()
-    if not (stamp.exists() and stamp.read_text() == made_from):
+    if not (stamp.exists() and stamp.read_text(encoding="utf-8") == made_from):
         target = this_target()
         ensure_venv()
         stamp.unlink(missing_ok=True)
@@ -34,7 +34,7 @@ def make(folder: Path, torch: str) -> None:
         install_bundle(target, python, torch)
         pip_requirements("install", locked("blender", target), python=python)
         pip_requirements("install", locked("tools", target), python=python)
-        stamp.write_text(made_from)
+        stamp.write_text(made_from, encoding="utf-8")
     check_blender(folder)
 
 
@@ -68,7 +68,7 @@ def check_blender(folder: Path) -> None:
     done = subprocess.run(
         [str(folder / "bin" / "python"), "-c", "import bpy; print(bpy.app.version_string)"],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         check=False,
     )
     if done.returncode:

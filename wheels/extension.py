@@ -39,7 +39,7 @@ def build(platform: str, pythons: tuple[str, ...], leave_out: frozenset[str] = f
     targets = tuple(Target(platform, python) for python in pythons)
     for target in targets:
         fetch(target, leave_out)
-    version = tomllib.loads(MANIFEST.read_text())["version"]
+    version = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
     pythons_name = "" if pythons == PYTHONS[:1] else "-py" + "_".join(python.replace(".", "") for python in pythons)
     without = "".join(f"-no_{name}" for name in sorted(leave_out))
     name = f"ct2hair-{version}-{platform.replace('-', '_')}{pythons_name}{without}"
@@ -63,7 +63,9 @@ def stage_extension(folder: Path, wheels: list[str], platforms: list[str]) -> No
             shutil.copytree(source, folder / entry, ignore=shutil.ignore_patterns("__pycache__", ".*"))
         else:
             shutil.copy2(source, folder / entry)
-    (folder / MANIFEST.name).write_text(manifest_with_wheels(MANIFEST.read_text(), wheels, platforms))
+    (folder / MANIFEST.name).write_text(
+        manifest_with_wheels(MANIFEST.read_text(encoding="utf-8"), wheels, platforms), encoding="utf-8"
+    )
     (folder / "wheels").mkdir()
     for file in wheels:
         try:
@@ -79,7 +81,7 @@ def blender_extension(*arguments: str) -> None:
     if not tools:
         raise LockError("Blender's extension tool comes with bpy, which this Python doesn't have; run `make setup`")
     done = subprocess.run(
-        [sys.executable, str(tools[-1]), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [sys.executable, str(tools[-1]), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
     )
     if done.returncode:
         raise LockError(f"Blender's extension tool refused to {arguments[0]}:\n{done.stdout}")

@@ -112,7 +112,7 @@ def locked(group: str, target: Target, lock: dict | None = None) -> dict[str, tu
 
 def pinned(group: str, target: Target) -> dict[str, str]:
     """The versions that pins.toml asks of a group for a target: name -> version."""
-    pins = tomllib.loads(PINS.read_text())[group]
+    pins = tomllib.loads(PINS.read_text(encoding="utf-8"))[group]
     pins = pins[target.python] if group == "blender" else pins
     versions = {name: pin if isinstance(pin, str) else pin.get(target.platform) for name, pin in pins.items()}
     return {name: version for name, version in versions.items() if version}
@@ -120,7 +120,7 @@ def pinned(group: str, target: Target) -> dict[str, str]:
 
 def read_lock() -> dict:
     """lock.toml as it stands: group -> name -> file -> sha256."""
-    return tomllib.loads(LOCK.read_text()) if LOCK.exists() else {}
+    return tomllib.loads(LOCK.read_text(encoding="utf-8")) if LOCK.exists() else {}
 
 
 def version_of(wheel: str) -> str:
@@ -143,7 +143,7 @@ def pip(*arguments: str, python: str = sys.executable, quiet: bool = False) -> N
         env={**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_ROOT_USER_ACTION": "ignore"},
         stdout=subprocess.DEVNULL if quiet else None,
         stderr=subprocess.PIPE,
-        text=True,
+        encoding="utf-8",
     )
     if done.returncode:
         errors = [line for line in done.stderr.splitlines() if not line.startswith("WARNING")]
@@ -154,7 +154,7 @@ def pip_requirements(command: str, wheels: dict[str, tuple[str, str]], *options:
     """Run `pip install` or `pip download` for exactly these wheels, by hash."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "requirements.txt"
-        file.write_text(requirements(wheels))
+        file.write_text(requirements(wheels), encoding="utf-8")
         pip(command, "-q", "--require-hashes", "--no-deps", "--only-binary=:all:", *options, "-r", str(file), python=python)
 
 
@@ -165,7 +165,7 @@ def find_wheels(names: dict[str, str], target: Target, python: str) -> dict[str,
         options = ["--dry-run", "--ignore-installed", "-q", "--target", folder, "--report", str(report), *target.pip_options()]
         pip("install", *options, *(f"{name}==={version}" for name, version in names.items()), python=python)
         found = {}
-        for item in json.loads(report.read_text())["install"]:
+        for item in json.loads(report.read_text(encoding="utf-8"))["install"]:
             name = re.sub(r"[-_.]+", "-", item["metadata"]["name"]).lower()
             file = item["download_info"]["url"].rsplit("/", 1)[1].replace("%2B", "+")
             found[name] = (file, item["download_info"]["archive_info"]["hashes"]["sha256"])
@@ -175,7 +175,7 @@ def find_wheels(names: dict[str, str], target: Target, python: str) -> dict[str,
 def update(python: str) -> None:
     """Write lock.toml anew from pins.toml and the index, keeping what the index at hand doesn't serve, and the manifest."""
     old, new = read_lock(), {}
-    for group in tomllib.loads(PINS.read_text()):
+    for group in tomllib.loads(PINS.read_text(encoding="utf-8")):
         for target in TARGETS:
             names = pinned(group, target)
             if not names:
@@ -200,8 +200,8 @@ def update(python: str) -> None:
     for group, packages in new.items():
         for name in sorted(packages):
             lines += [f"\n[{group}.{name}]\n", *(f'"{file}" = "{packages[name][file]}"\n' for file in sorted(packages[name]))]
-    LOCK.write_text("".join(lines))
-    MANIFEST.write_text(manifest_with_wheels(MANIFEST.read_text(), bundled_wheels(TARGETS)))
+    LOCK.write_text("".join(lines), encoding="utf-8")
+    MANIFEST.write_text(manifest_with_wheels(MANIFEST.read_text(encoding="utf-8"), bundled_wheels(TARGETS)), encoding="utf-8")
 
 
 def locked_or_none(group: str, target: Target, lock: dict) -> dict[str, tuple[str, str]]:

@@ -63,7 +63,7 @@ def missing_libraries(*objects: Path) -> set[str]:
     if not sys.platform.startswith("linux"):
         return set()
     done = subprocess.run(
-        ["ldd", *map(str, objects)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False
+        ["ldd", *map(str, objects)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, encoding="utf-8", check=False
     )
     return set(re.findall(r"^\s*(\S+) => not found", done.stdout, flags=re.MULTILINE))
 

@@ -89,7 +89,7 @@ class Bench:
         """The case's scan, made where it isn't there yet."""
         path = self.folder / "scans" / f"{case.name}.vdb"
         done = path.with_suffix(".json")
-        if not done.is_file() or json.loads(done.read_text()).get("sources") != sources():
+        if not done.is_file() or json.loads(done.read_text(encoding="utf-8")).get("sources") != sources():
             self.say(f"{case.name}: making the scan")
             path.parent.mkdir(parents=True, exist_ok=True)
             head = template_head()
@@ -114,10 +114,10 @@ class Bench:
         path = self.folder / "results" / f"{name}.{key[:12]}.json"
         if path.is_file():
             self.say(f"{name}: known")
-            return json.loads(path.read_text())
+            return json.loads(path.read_text(encoding="utf-8"))
         result = work()
         _write_json(path, result)
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
 
     def density(self, folder: Path, head: HeadMesh, settings: Settings) -> BrickVolume:
         """The wig's density of a run, the net taken out as in the run itself."""

@@ -152,7 +152,6 @@ def start(
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
-            text=True,
             encoding="utf-8",
             env=_environment(paths, own=python is None, more=environment),
             cwd=ROOT,
@@ -210,7 +209,12 @@ def check_python(python: str | None = None, timeout: float = 120.0) -> PythonFou
     command = [python or sys.executable, "-c", script]
     try:
         run = subprocess.run(
-            command, capture_output=True, text=True, timeout=timeout, check=False, env=_environment((), own=python is None)
+            command,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=timeout,
+            check=False,
+            env=_environment((), own=python is None),
         )
         version, device, missing = json.loads(run.stdout.strip().splitlines()[-1])
     except FileNotFoundError:
@@ -226,7 +230,8 @@ def _environment(paths: Iterable[str], own: bool, more: Mapping[str, str] | None
     """The worker's environment. Another Python gets the engine alone: our site-packages would be of the wrong version."""
     inherited = [entry for entry in sys.path if entry.rstrip("/\\").endswith("site-packages")] if own else []
     folders = dict.fromkeys([str(ROOT), *map(str, paths), *inherited])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), PARENT: str(os.getpid()), **(more or {})}
+    ours = {"PYTHONPATH": os.pathsep.join(folders), "PYTHONUTF8": "1", PARENT: str(os.getpid())}  # its log is UTF-8 anywhere
+    environment = {**os.environ, **ours, **(more or {})}
     environment.pop("PYTHONHOME", None)
     kernels = environment.get("NUMBA_CACHE_DIR", "")
     if kernels.startswith(str(cache_folder() / "kernels")):

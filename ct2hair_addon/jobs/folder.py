@@ -38,14 +38,14 @@ class JobFolder:
             "settings": settings.to_dict(),
         }
         beside = folder.path / ".job.json.part"
-        beside.write_text(json.dumps(values, indent=2))
+        beside.write_text(json.dumps(values, indent=2), encoding="utf-8")
         beside.replace(folder.description)
         return folder
 
     def read(self) -> tuple[Path, Path, Settings, tuple[int, ...] | None, str | None, str | None]:
         """(scan, out, settings, shape and type of a raw scan, stage to stop after). CT2HairError where job.json is bad."""
         try:
-            values = json.loads(self.description.read_text())
+            values = json.loads(self.description.read_text(encoding="utf-8"))
             shape = values["raw_shape"]
             return (
                 Path(values["scan"]),

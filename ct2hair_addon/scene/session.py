@@ -253,7 +253,7 @@ def start_inspection(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     chosen = folder / "inspection.json"
-    chosen.write_text(json.dumps({"scan": settings.to_dict()["scan"]}))
+    chosen.write_text(json.dumps({"scan": settings.to_dict()["scan"]}), encoding="utf-8")
     _expose_bundled_modules()
     arguments = ["inspect", str(Path(scan).resolve()), "--out", str((folder / "inspection.npz").resolve())]
     arguments += ["--settings", str(chosen.resolve())]

@@ -114,7 +114,7 @@ class ScanWriter:
         self._release()
         if self.format == ".mhd":
             self._beside.replace(self.path.with_suffix(".raw"))
-            self._beside.write_text(self._meta_header(self.path.with_suffix(".raw").name))
+            self._beside.write_text(self._meta_header(self.path.with_suffix(".raw").name), encoding="utf-8")
         self._beside.replace(self.path)
 
     def abort(self) -> None:

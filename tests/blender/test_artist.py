@@ -347,7 +347,7 @@ def test_parameters_go_to_json_and_back(tmp_path):
     owner = bpy.context.scene.ct2hair
     owner.settings.guides.step = 0.5
     assert attempt("settings_save", filepath=str(tmp_path / "mine.json")) == {"FINISHED"}
-    assert Settings.from_json((tmp_path / "mine.json").read_text()).guides.step == 0.5
+    assert Settings.from_json((tmp_path / "mine.json").read_text(encoding="utf-8")).guides.step == 0.5
     owner.settings.guides.step = 1.0
     assert attempt("settings_load", filepath=str(tmp_path / "mine.json")) == {"FINISHED"}
     assert owner.settings.guides.step == 0.5
@@ -367,7 +367,7 @@ def test_a_preset_is_kept_in_a_file_and_played(tmp_path, monkeypatch):
     assert bpy.ops.ct2hair.preset_add(name="fine") == {"FINISHED"}
     (file,) = tmp_path.rglob("fine.py")
     owner.settings.guides.step, owner.settings.scan.spacing = 1.0, 0.3
-    exec(compile(file.read_text(), str(file), "exec"), {})
+    exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), {})
     assert owner.settings.guides.step == 0.25 and owner.settings.scan.spacing == pytest.approx(0.3)
 
 
@@ -410,7 +410,7 @@ def test_only_our_own_is_cleared_from_the_cache(tmp_path, monkeypatch):
 
 
 def test_a_stopped_job_shows_its_stage(job_folder):
-    report = json.loads((job_folder / "report.json").read_text())
+    report = json.loads((job_folder / "report.json").read_text(encoding="utf-8"))
     state = {"program": {"version": "0.1.0"}, "settings": {}, **{key: report[key] for key in ("scan", "head")}}
     for until, kinds in (("scan", {"VOLUME"}), ("head", {"VOLUME", "MESH"}), ("guides", {"VOLUME", "MESH", "CURVES"})):
         head = {} if until == "scan" else state["head"]

@@ -41,7 +41,7 @@ def stand_in(extension, job_folder, monkeypatch):
         def start_job(scan, folder, settings, head=None, until=None, **options):
             log = jobs.JobFolder.create(scan, job_folder, settings)
             process = subprocess.Popen(
-                [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+                [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8"
             )
             return jobs.Job(log, process)
 

@@ -26,9 +26,9 @@ def test_all_of_this_holds_in_blender_5_2():
     if python is None:
         pytest.skip(f"no Blender 5.2 on this machine: set {VARIABLE} to a Python that has bpy 5.2, or run `make venv52`")
     version = "import bpy; print('bpy', bpy.app.version_string)"
-    told = subprocess.run([python, "-c", version], capture_output=True, text=True, check=False, timeout=120)
+    told = subprocess.run([python, "-c", version], capture_output=True, encoding="utf-8", check=False, timeout=120)
     assert "bpy 5.2" in told.stdout, f"{python} has no bpy 5.2: {told.stdout[-500:]}{told.stderr[-500:]}"
     command = [python, "-m", "pytest", "-q", str(ROOT / "tests" / "blender"), "-p", "no:cacheprovider"]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False, timeout=600)
     print(run.stdout[-3000:])
     assert run.returncode == 0, run.stdout[-6000:] + run.stderr[-2000:]

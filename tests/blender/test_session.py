@@ -87,7 +87,7 @@ def test_a_damaged_result_leaves_the_scene_as_it_was(job_folder, damage, message
 
 
 def test_a_mirrored_placement_is_refused(job_folder):
-    report = json.loads((job_folder / "report.json").read_text())
+    report = json.loads((job_folder / "report.json").read_text(encoding="utf-8"))
     report["head"]["head_to_scan"] = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
     (job_folder / "report.json").write_text(json.dumps(report))
     with pytest.raises(CT2HairError, match="rotation"):

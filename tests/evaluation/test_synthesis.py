@@ -27,7 +27,7 @@ def test_a_clean_scan_is_the_blurred_count(ball, spikes, tmp_path):
     np.testing.assert_allclose(scan, expected.block((0, 0, 0), scan.shape), atol=1e-6)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.head.obj", "scan.json", "scan.npy", "scan.strands.npz"]
     # an array file holds no origin, so the truth is moved into the array's frame
-    moved = json.loads((tmp_path / "scan.json").read_text())["moved_by_mm"]
+    moved = json.loads((tmp_path / "scan.json").read_text(encoding="utf-8"))["moved_by_mm"]
     np.testing.assert_allclose(Strands.load(tmp_path / "scan.strands.npz").points, spikes.points + np.float32(moved), atol=1e-4)
 
 

@@ -30,7 +30,7 @@ def serve():
         try:
             window = bpy.context.window_manager.windows[0]
             with bpy.context.temp_override(window=window):
-                exec(request.read_text(), names)
+                exec(request.read_text(encoding="utf-8"), names)
             said = {"answer": names["answer"]}
         except Exception:
             said = {"error": traceback.format_exc()}

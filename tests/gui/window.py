@@ -46,7 +46,7 @@ class DebianBlender:
             cls._make(folder)
         if not (folder / "proc/self").exists():
             run = subprocess.run(
-                ["mount", "-t", "proc", "proc", str(folder / "proc")], capture_output=True, text=True, check=False
+                ["mount", "-t", "proc", "proc", str(folder / "proc")], capture_output=True, encoding="utf-8", check=False
             )
             if run.returncode:
                 raise Unavailable(f"/proc can't be mounted in {folder}: {run.stderr.strip()}")
@@ -67,7 +67,7 @@ class DebianBlender:
             ["chroot", str(folder), "apt-get", "install", "-y", "-qq", "--no-install-recommends", *PACKAGES],
         ):
             environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-            run = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+            run = subprocess.run(command, capture_output=True, encoding="utf-8", check=False, env=environment)
             if run.returncode:
                 raise Unavailable(f"{' '.join(command[:4])} ... failed: {(run.stderr or run.stdout).strip()[-300:]}")
 
@@ -76,7 +76,7 @@ class DebianBlender:
         done = subprocess.run(
             ["chroot", str(self.folder), *command],
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             timeout=timeout,
             check=False,
             env=self._environment(variables),
@@ -140,11 +140,13 @@ class DebianBlender:
         end, done = time.monotonic() + timeout, request.with_suffix(".json")
         while not done.is_file():
             if any(process.poll() is not None for process in self._processes):
-                raise AssertionError("Blender or its display ended: " + (self.home / "blender.log").read_text()[-2000:])
+                raise AssertionError(
+                    "Blender or its display ended: " + (self.home / "blender.log").read_text(encoding="utf-8")[-2000:]
+                )
             if time.monotonic() > end:
                 raise AssertionError(f"no answer within {timeout:g} s to: {code}")
             time.sleep(0.02)
-        said = json.loads(done.read_text())
+        said = json.loads(done.read_text(encoding="utf-8"))
         done.unlink()
         if "error" in said:
             raise AssertionError(said["error"])

@@ -90,7 +90,7 @@ def reached(job: Job, stage: str) -> bool:
 def alive(pid: int) -> bool:
     """Whether the process runs (a zombie doesn't)."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
 
@@ -101,7 +101,7 @@ def test_a_job_tells_its_stages_progress_warnings_and_result(begin):
     assert result.data["strands"] == 3 and result.data["seconds"] == 0.5
     assert job.warnings == ["assumed a spacing"] and job.error is None and job.exit_code == 0
     assert job.fraction == 1.0 and not job.running
-    log = job.log_path.read_text()
+    log = job.log_path.read_text(encoding="utf-8")
     assert "noise that must not reach the protocol" in log and "native noise" in log
 
 
@@ -109,7 +109,7 @@ def test_a_refusal_is_told_in_its_own_words_with_the_log(begin):
     job = begin("refused")
     assert job.wait(30) is None
     assert "holds no hair" in job.error and job.exit_code == 1
-    assert "ScanError" in job.log_path.read_text()
+    assert "ScanError" in job.log_path.read_text(encoding="utf-8")
 
 
 def test_a_bug_and_a_crash_name_the_log(begin):
@@ -157,7 +157,9 @@ def test_the_worker_ends_when_its_starter_is_killed(tmp_path):
     root = Path(__file__).resolve().parents[2]
     process = subprocess.Popen([sys.executable, "-c", starter], cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
     try:
-        pid = int(wait_for(lambda: (tmp_path / "out" / "pid").exists() and (tmp_path / "out" / "pid").read_text()))
+        pid = int(
+            wait_for(lambda: (tmp_path / "out" / "pid").exists() and (tmp_path / "out" / "pid").read_text(encoding="utf-8"))
+        )
         assert alive(pid)
         process.kill()
         process.wait()

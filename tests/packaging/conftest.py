@@ -69,7 +69,7 @@ class FreshBlender:
             },
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            text=True,
+            encoding="utf-8",
             timeout=timeout,
             check=False,
         )
@@ -99,7 +99,7 @@ def fresh_blender(folder: Path, python: Path) -> FreshBlender:
         (information,) = (
             path for path in theirs.glob("*.dist-info") if path.name.split("-")[0].lower().replace("_", "-") == name
         )
-        for line in (information / "RECORD").read_text().splitlines():
+        for line in (information / "RECORD").read_text(encoding="utf-8").splitlines():
             file = Path(line.rsplit(",", 2)[0].strip('"'))
             if file.parts[0] != ".." and "__pycache__" not in file.parts:
                 (ours / file).parent.mkdir(parents=True, exist_ok=True)

@@ -36,7 +36,7 @@ def check(folder: Path, config: Path = ROOT / "pyproject.toml") -> subprocess.Co
         env={**os.environ, "PYTHONPATH": str(folder)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
+        encoding="utf-8",
         check=False,
     )
 

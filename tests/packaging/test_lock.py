@@ -35,7 +35,7 @@ def test_the_lock_holds_nothing_that_no_pin_asks_for():
 
 
 def test_the_manifest_names_the_locked_wheels():
-    manifest = tomllib.loads(lock.MANIFEST.read_text())
+    manifest = tomllib.loads(lock.MANIFEST.read_text(encoding="utf-8"))
     assert manifest["wheels"] == [f"./wheels/{file}" for file in lock.bundled_wheels(lock.TARGETS)]
     assert manifest["platforms"] == list(lock.PLATFORMS)
 
@@ -43,8 +43,8 @@ def test_the_manifest_names_the_locked_wheels():
 def test_manifest_engine_and_project_have_one_version():
     from ct2hair_addon import __version__
 
-    manifest = tomllib.loads(lock.MANIFEST.read_text())
-    project = tomllib.loads((lock.ROOT / "pyproject.toml").read_text())["project"]
+    manifest = tomllib.loads(lock.MANIFEST.read_text(encoding="utf-8"))
+    project = tomllib.loads((lock.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert manifest["version"] == project["version"] == __version__
 
 
@@ -59,7 +59,7 @@ def test_blenders_own_packages_are_not_bundled():
 
 def test_no_package_index_is_named():
     for path in (lock.LOCK, lock.PINS, lock.MANIFEST):
-        assert "://" not in path.read_text()
+        assert "://" not in path.read_text(encoding="utf-8")
 
 
 def test_what_a_bundled_package_needs_is_bundled_or_blenders_own():
@@ -101,7 +101,7 @@ def test_every_import_of_the_extension_is_bundled_or_blenders_own():
     there |= {"structure_tensor"}  # the benchmark's peer, a test tool: who lacks it is told so
     missing = set()
     for path in [lock.ROOT / "__init__.py", *(p for room in extension.ROOMS for p in (lock.ROOT / room).rglob("*.py"))]:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
             for name in {name.partition(".")[0] for name in names} - there:

@@ -43,7 +43,7 @@ def test_missing_libraries_are_what_the_loader_does_not_find(machine):
 def test_root_installs_the_names_of_this_release(machine):
     log = machine(0, ldd=LACKING, apt_get=APT, apt_cache='test "$2" != libasound2t64')
     ensure_libraries(Path("bpy.so"))
-    update, install = log.read_text().splitlines()
+    update, install = log.read_text(encoding="utf-8").splitlines()
     assert "update" in update
     assert install.endswith("--no-install-recommends libx11-6 libasound2")
 
@@ -51,7 +51,7 @@ def test_root_installs_the_names_of_this_release(machine):
 def test_names_of_a_release_with_64_bit_time(machine):
     log = machine(0, ldd=LACKING, apt_get=APT, apt_cache="exit 0")
     ensure_libraries(Path("bpy.so"))
-    assert log.read_text().splitlines()[1].endswith("libx11-6 libasound2t64")
+    assert log.read_text(encoding="utf-8").splitlines()[1].endswith("libx11-6 libasound2t64")
 
 
 def test_others_get_the_one_line(machine):
