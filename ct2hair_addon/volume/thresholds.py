@@ -29,7 +29,9 @@ from .structure import (
     TAPS,
     cut_block,
     find_peaks,
+    flat_limit,
     local_mean,
+    ripple,
     smoothed,
 )
 
@@ -57,7 +59,7 @@ HAIR_SHARE = 0.4
 KNOT_SHARE = 2.2
 """A knot is denser than two strands that touch."""
 SOLID_SHARE = 4.0
-"""The mannequin's local mean is above so many lone strands' peaks; a large body below that can't be told from dense hair."""
+"""The mannequin's local mean is above so many lone strands' peaks, and its material is flat, which dense hair never is."""
 SOLID_VOLUME = 10_000.0
 """mm^3; a smaller body is no mannequin."""
 
@@ -110,7 +112,11 @@ def find_thresholds(reader: ScanReader, settings: ScanSettings, progress: Progre
     hair = settings.hair if "hair" in chosen else air + HAIR_SHARE * strand
     knots = settings.knots if "knots" in chosen else air + KNOT_SHARE * strand
     volume = float(np.prod(np.array(reader.shape) * reader.spacing))
-    solid = settings.solid if "solid" in chosen else _solid_level(means, air, strand, volume)
+    solid = (
+        settings.solid
+        if "solid" in chosen
+        else _solid_level(means, air, strand, volume, flat_limit(float(np.mean(reader.spacing))))
+    )
     progress(1.0, 1.0)
     return Thresholds(float(air), float(noise), float(strand), float(hair), float(knots), solid, int(lines), chosen)
 
@@ -257,7 +263,7 @@ def _peaks(reader: ScanReader, slabs, air: float, noise: float, progress: Progre
         value = np.empty((len(corners), MOST_PEAKS, 2), np.float32)
         directions = np.empty((len(corners), MOST_PEAKS, 2), np.int16)
         counts = np.zeros(len(corners), np.int64)
-        some = np.empty((len(corners), 6, 6, 6, 2), np.float32)
+        some = np.empty((len(corners), 6, 6, 6, 3), np.float32)
         _look(
             slab,
             corners,
@@ -274,7 +280,7 @@ def _peaks(reader: ScanReader, slabs, air: float, noise: float, progress: Progre
         for n, count in enumerate(counts):
             peaks.append(value[n, :count].copy())
             goes_on.append(directions[n, :count].copy())
-        means.append(some.reshape(-1, 2))
+        means.append(some.reshape(-1, 3))
     looked = min(seen / np.prod(reader.shape, dtype=float), 1.0)
     return np.concatenate(peaks), np.concatenate(goes_on), np.concatenate(means), looked
 
@@ -295,15 +301,18 @@ def _look(slab, corners, air, least, taps, directions, persists, value, goes_on,
             for j in range(6):
                 for k in range(6):
                     means[n, i, j, k, 0] = mean[8 * i, 8 * j, 8 * k]
-                    means[n, i, j, k, 1] = smooth[8 * i + HALO - 3, 8 * j + HALO - 3, 8 * k + HALO - 3]
+                    a, b, c = 8 * i + HALO - 3, 8 * j + HALO - 3, 8 * k + HALO - 3
+                    means[n, i, j, k, 1] = smooth[a, b, c]
+                    means[n, i, j, k, 2] = ripple(smooth, a, b, c)
 
 
-def _solid_level(means: np.ndarray, air: float, strand: float, volume: float) -> float | None:
-    """The value half way from air to the mannequin's material, from pairs (local mean, smoothed); None without one.
+def _solid_level(means: np.ndarray, air: float, strand: float, volume: float, flat: float) -> float | None:
+    """The value half way from air to the mannequin's material, from (local mean, smoothed, ripple); None without one.
 
-    volume: mm^3 of the scan. A mannequin is a body of at least SOLID_VOLUME, denser than hair is anywhere over a while.
+    volume: mm^3 of the scan. flat: the most that a body's material ripples. A mannequin is a body of at least SOLID_VOLUME,
+    denser than most hair is over a while.
     """
-    dense = means[means[:, 0] > SOLID_SHARE * strand, 1]
+    dense = means[(means[:, 0] > SOLID_SHARE * strand) & (means[:, 2] < flat), 1]
     if volume * len(dense) / max(len(means), 1) < SOLID_VOLUME:
         return None
     # a thin wall nowhere fills the cube of the mean, but reaches its own value in the middle

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy import ndimage
 
 from ..errors import ScanError
 from ..progress import Progress, silent
 from ..settings import ScanSettings
+from .bodies import CLEAR, Bodies
 from .grid import BRICK, BrickVolume
 from .readers import ScanReader
 from .resampling import CubicScan, cubic
@@ -32,7 +32,9 @@ from .structure import (
     bump,
     cut_block,
     find_peaks,
+    flat_limit,
     local_mean,
+    ripple,
     smoothed,
 )
 from .thresholds import BELOW_NOISE, BLOCK, SOLID_VOLUME, Thresholds
@@ -43,12 +45,12 @@ LEAST_VOXELS = 4
 """Strand-like voxels in and just around a brick for it to be kept: fewer are noise."""
 MARGIN = 2
 """Voxels around a brick that are looked at, too, so that a strand's flank beyond its brick is kept."""
-CLEAR = 3
-"""Voxels around the mannequin that are cleared with it: its blurred edge."""
 CONTRAST = 0.4
 """A voxel is strand-like where the smoothed density exceeds the local mean by this share of a lone strand's smoothed peak."""
 CORE_MEAN = 0.4
-"""Inside a body the local mean, too, is above this share of its threshold; over a bundle of hair it is not."""
+"""Inside a body the local mean, too, is above this share of its threshold; over a thin bundle of hair it is not."""
+FLAT_EVERY = 2
+"""Ripple is measured at every second voxel along each axis."""
 KNOT_LINE = 55
 """A blob keeps at most this share, percent, of its peak on both sides in its best direction."""
 BUMP = 0.6
@@ -57,10 +59,6 @@ MOST_KNOTS = 1024
 """Knots noted in a block of 48^3 voxels."""
 ENOUGH_BUMPS = 500
 """Knots on the mannequin's skin from which on no others are needed."""
-CELL = 4
-"""Voxels of a cell in which bodies are told apart."""
-MOST_SOLID = 200_000
-"""Points kept of the mannequin's surface."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +85,13 @@ def import_scan(
 ) -> WigScan:
     """The wig in a scan. Voxels that are no cubes are resampled to cubes. Raises ScanError where no hair is left."""
     scan = cubic(reader)
-    levels = _Levels.of(thresholds)
+    levels = _Levels.of(thresholds, float(scan.spacing[0]))
     size = [scan.shape[axis] for axis in scan.order]
     table = np.full([-(-n // BRICK) for n in size], -1, np.int32)
     core_table = table.copy()
     bricks: list[np.ndarray] = []
     cores: list[np.ndarray] = []
+    flats: list[np.ndarray] = []
     wanted: list[np.ndarray] = []
     knots: list[np.ndarray] = []
     bumps: list[np.ndarray] = []
@@ -115,27 +114,24 @@ def import_scan(
         core_table[tuple(place[dense].T)] = solid + np.arange(len(dense), dtype=np.int32)
         solid += len(dense)
         cores.append(found.cores[tuple(rows[dense].T)])
+        flats.append(found.flats[tuple(rows[dense].T)])
     values = np.concatenate(bricks) if bricks else np.zeros((0, BRICK, BRICK, BRICK), np.float32)
     del bricks
-    core_rows = np.concatenate(cores) if cores else np.zeros((0, BRICK, BRICK), np.uint16)
+    dense, flat = (np.concatenate(parts) if parts else np.zeros((0, BRICK, BRICK), np.uint16) for parts in (cores, flats))
     keep = np.concatenate(wanted) if wanted else np.zeros(0, bool)
     cell = float(scan.spacing[0])
-    body, volume = _bodies(core_table, core_rows, cell)
+    bodies = Bodies.of(core_table, dense, flat, cell)
     surface = np.zeros((0, 3))
     cleared = 0
-    if volume > 0.0:
-        surface = _surface(core_table, body, size)
+    if bodies.volume > 0.0:
+        surface = bodies.surface(size)
         index = np.empty((len(values), 3), np.int32)
         where = np.argwhere(table >= 0)
         index[table[tuple(where.T)]] = where
-        clear = np.zeros(len(values), np.int64)
-        _clear(core_table, body, index, values, clear)
-        cleared = int(clear.sum())
-        inside = core_table[tuple(index.T)]
-        of_body = np.zeros(len(values), bool)
-        of_body[inside >= 0] = body[inside[inside >= 0]].any(axis=(1, 2))
+        cleared = bodies.clear(index, values)
         # what is stored for its dense voxels alone stays where that was hair after all
-        keep |= (inside >= 0) & ~of_body
+        keep |= (core_table[tuple(index.T)] >= 0) & ~bodies.lie_in(index)
+        bumps = [found[bodies.near(found)] for found in bumps]
         if sum(len(found) for found in bumps) >= ENOUGH_BUMPS:
             # knots on the mannequin's skin are sure; blobs elsewhere are hair that crosses
             knots = [np.zeros((0, 3), np.int32)]
@@ -160,7 +156,7 @@ def import_scan(
             f"{scan.path}: no hair is left above air ({thresholds.air:.6g}) at the hair level {thresholds.hair:.6g}; "
             "set scan.hair lower"
         )
-    if thresholds.solid is not None and volume == 0.0:
+    if thresholds.solid is not None and bodies.volume == 0.0:
         where = f"no body of at least {SOLID_VOLUME / 1000:.0f} cm3 lies above scan.solid ({thresholds.solid:.6g})"
         warnings = (*scan.warnings, f"{where}: the scan is taken as having no mannequin")
     else:
@@ -176,15 +172,19 @@ def import_scan(
 
 @dataclass(frozen=True)
 class _Levels:
-    """Densities above air: strand-like contrast, knots (smoothed), the mannequin's core; float32. solid is huge for none."""
+    """Densities above air: strand-like contrast, knots (smoothed), the mannequin's core; float32. solid is huge for none.
+
+    flat: the ripple that the mannequin stays below; huge where the settings give the mannequin's level, which then decides.
+    """
 
     air: np.float32
     contrast: np.float32
     knots: np.float32
     solid: np.float32
+    flat: np.float32
 
     @classmethod
-    def of(cls, thresholds: Thresholds) -> _Levels:
+    def of(cls, thresholds: Thresholds, spacing: float) -> _Levels:
         contrast = max(
             CONTRAST * LINE_SHARE * thresholds.strand, 0.8 * BELOW_NOISE * NOISE_SHARE * thresholds.noise, 1e-30
         )  # fmt: skip
@@ -192,16 +192,21 @@ class _Levels:
             contrast = LINE_SHARE * (thresholds.hair - thresholds.air)
         knots = LINE_SHARE * (thresholds.knots - thresholds.air)
         solid = thresholds.solid - thresholds.air if thresholds.solid is not None else 3e38
-        return cls(*(np.float32(value) for value in (thresholds.air, contrast, knots, solid)))
+        flat = 3e38 if "solid" in thresholds.chosen else flat_limit(spacing)
+        return cls(*(np.float32(value) for value in (thresholds.air, contrast, knots, solid, flat)))
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What a slab holds. flags: (bricks) uint8, 1 strand-like, 2 dense core. cores: uint16 rows of core voxels. knots, bumps:
-    (K, 3) voxels of blobs in the hair and on the mannequin's skin. hair: strand-like voxels."""
+    """What a slab holds.
+
+    flags: (bricks) uint8, 1 strand-like, 2 dense core. cores, flats: uint16 rows of core voxels and of those that are flat.
+    knots, bumps: (K, 3) voxels of blobs in the hair and on the mannequin's skin. hair: strand-like voxels.
+    """
 
     flags: np.ndarray
     cores: np.ndarray
+    flats: np.ndarray
     knots: np.ndarray
     bumps: np.ndarray
     hair: int
@@ -247,20 +252,23 @@ def _look(slab: np.ndarray, before: int, low: int, size, levels: _Levels) -> _Fo
     shape = [-(-own // BRICK), *(-(-n // BRICK) for n in slab.shape[1:])]
     flags = np.zeros(shape, np.uint8)
     cores = np.zeros((*shape, BRICK, BRICK), np.uint16) if levels.solid < 3e38 else np.zeros((0, 0, 0, BRICK, BRICK), np.uint16)
+    flats = np.zeros_like(cores)
     corners = np.stack(np.meshgrid(*(np.arange(0, n, BLOCK // BRICK) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
     knots = np.empty((len(corners), MOST_KNOTS, 3), np.int32)
     counts = np.zeros((len(corners), 3), np.int64)
     _mark(
-        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, TAPS, DIRECTIONS, flags, cores,
-        knots, counts,
+        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, levels.flat, TAPS, DIRECTIONS,
+        flags, cores, flats, knots, counts,
     )  # fmt: skip
     on_skin = np.concatenate([knots[n, :count] for n, count in enumerate(counts[:, 2])]) + [low, 0, 0]
     in_hair = np.concatenate([knots[n, first:end] for n, (end, _, first) in enumerate(counts)]) + [low, 0, 0]
-    return _Found(flags, cores, in_hair, on_skin, int(counts[:, 1].sum()))
+    return _Found(flags, cores, flats, in_hair, on_skin, int(counts[:, 1].sum()))
 
 
 @numba.njit(cache=True, parallel=True, nogil=True)
-def _mark(slab, before, own, corners, air, contrast, knots, solid, taps, directions, flags, cores, places, counts):
+def _mark(
+    slab, before, own, corners, air, contrast, knots, solid, flat, taps, directions, flags, cores, flats, places, counts
+):  # fmt: skip
     reach = MARGIN + CLEAR
     for n in numba.prange(len(corners)):
         low = corners[n] * BRICK
@@ -288,7 +296,13 @@ def _mark(slab, before, own, corners, air, contrast, knots, solid, taps, directi
                             I, J, K = corners[n, 0] + i // BRICK, corners[n, 1] + j // BRICK, corners[n, 2] + k // BRICK
                             if I < flags.shape[0] and J < flags.shape[1] and K < flags.shape[2]:
                                 flags[I, J, K] |= 2
-                                cores[I, J, K, i % BRICK, j % BRICK] |= np.uint16(1) << np.uint16(k % BRICK)
+                                bit = np.uint16(1) << np.uint16(k % BRICK)
+                                cores[I, J, K, i % BRICK, j % BRICK] |= bit
+                                if i % FLAT_EVERY or j % FLAT_EVERY or k % FLAT_EVERY:
+                                    continue
+                                inner = reach + edge
+                                if ripple(smooth, i + inner, j + inner, k + inner) < flat:
+                                    flats[I, J, K, i % BRICK, j % BRICK] |= bit
             _widen(near, CLEAR)
             counts[n, 0] = counts[n, 2] = _bumps(
                 smooth, mean, near, reach, edge, solid, BUMP * knots / BLOB_VARIANCE, low, own, places[n]
@@ -390,178 +404,6 @@ def _cut_bricks(slab, rows, before, air, out):
     for n in numba.prange(len(rows)):
         start = np.array([rows[n, 0] * BRICK + before, rows[n, 1] * BRICK, rows[n, 2] * BRICK])
         cut_block(slab, start, 0, air, out[n])
-
-
-def _bodies(core_table: np.ndarray, core_rows: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
-    """((C, 16, 16) uint16 rows of the core voxels that belong to large bodies, their volume in mm^3)."""
-    if not len(core_rows):
-        return core_rows, 0.0
-    per_brick = BRICK // CELL
-    cells = np.zeros((len(core_rows), per_brick, per_brick, per_brick), np.int16)
-    _count_cells(core_rows, cells)
-    where = np.argwhere(core_table >= 0)
-    rows = core_table[tuple(where.T)]
-    low, high = where.min(axis=0), where.max(axis=0) + 1
-    grid = np.zeros([*(per_brick * (high - low))], bool)
-    spread = grid.reshape(high[0] - low[0], per_brick, high[1] - low[1], per_brick, high[2] - low[2], per_brick)
-    at = where - low
-    spread[at[:, 0], :, at[:, 1], :, at[:, 2], :] = cells[rows] > CELL**3 // 8
-    label, count = ndimage.label(grid, np.ones((3, 3, 3)))
-    labels = label.reshape(spread.shape)[at[:, 0], :, at[:, 1], :, at[:, 2], :]
-    volume = np.bincount(labels.ravel(), cells[rows].ravel(), count + 1) * spacing**3
-    large = volume >= SOLID_VOLUME
-    large[0] = False
-    body = np.zeros(cells.shape, bool)
-    body[rows] = large[labels]
-    # cells that hold only a rim of the body
-    near = np.zeros(grid.shape, bool)
-    near_spread = near.reshape(spread.shape)
-    near_spread[at[:, 0], :, at[:, 1], :, at[:, 2], :] = body[rows]
-    near = ndimage.binary_dilation(near, np.ones((3, 3, 3)))
-    body[rows] = near.reshape(spread.shape)[at[:, 0], :, at[:, 1], :, at[:, 2], :] & ((labels == 0) | large[labels])
-    kept = core_rows.copy()
-    _only_cells(kept, body)
-    return kept, float(volume[large].sum())
-
-
-@numba.njit(cache=True, parallel=True)
-def _count_cells(rows, cells):
-    for n in numba.prange(len(rows)):
-        for i in range(BRICK):
-            for j in range(BRICK):
-                for k in range(BRICK):
-                    if (rows[n, i, j] >> np.uint16(k)) & 1:
-                        cells[n, i // CELL, j // CELL, k // CELL] += 1
-
-
-@numba.njit(cache=True, parallel=True)
-def _only_cells(rows, kept):
-    for n in numba.prange(len(rows)):
-        for i in range(BRICK):
-            for j in range(BRICK):
-                mask = 0
-                for c in range(BRICK // CELL):
-                    if kept[n, i // CELL, j // CELL, c]:
-                        mask |= ((1 << CELL) - 1) << (CELL * c)
-                rows[n, i, j] &= np.uint16(mask)
-
-
-@numba.njit(cache=True, inline="always")
-def _row(table, rows, i, j, K):
-    """16 core bits of the voxels (i, j) of brick layer K; 0 where there are none."""
-    if i < 0 or j < 0 or K < 0:
-        return np.uint64(0)
-    I, J = i // BRICK, j // BRICK
-    if I >= table.shape[0] or J >= table.shape[1] or K >= table.shape[2]:
-        return np.uint64(0)
-    at = table[I, J, K]
-    return np.uint64(rows[at, i % BRICK, j % BRICK]) if at >= 0 else np.uint64(0)
-
-
-@numba.njit(cache=True, parallel=True)
-def _clear(table, rows, index, bricks, cleared):
-    """Set the voxels within CLEAR of a body's core to 0; counts them per brick."""
-    for n in numba.prange(len(bricks)):
-        K = index[n, 2]
-        for i in range(BRICK):
-            for j in range(BRICK):
-                near = np.uint64(0)
-                for a in range(-CLEAR, CLEAR + 1):
-                    for b in range(-CLEAR, CLEAR + 1):
-                        left = CLEAR * CLEAR - a * a - b * b
-                        if left < 0:
-                            continue
-                        x, y = BRICK * index[n, 0] + i + a, BRICK * index[n, 1] + j + b
-                        # bit CLEAR is the brick's first voxel
-                        line = _row(table, rows, x, y, K) << np.uint64(CLEAR)
-                        line |= _row(table, rows, x, y, K - 1) >> np.uint64(BRICK - CLEAR)
-                        line |= (_row(table, rows, x, y, K + 1) & np.uint64((1 << CLEAR) - 1)) << np.uint64(BRICK + CLEAR)
-                        if line:
-                            reach = int(np.sqrt(left))
-                            near |= line
-                            for c in range(1, reach + 1):
-                                near |= (line << np.uint64(c)) | (line >> np.uint64(c))
-                near >>= np.uint64(CLEAR)
-                if near:
-                    for k in range(BRICK):
-                        if (near >> np.uint64(k)) & np.uint64(1):
-                            bricks[n, i, j, k] = 0.0
-                            cleared[n] += 1
-
-
-def _surface(table: np.ndarray, rows: np.ndarray, size) -> np.ndarray:
-    """(S, 3) voxels on the outer surface of bodies, a shell's inner one and cuts by the scan's border left out."""
-    where = np.argwhere(table >= 0).astype(np.int64)
-    total = int(sum(int(np.bitwise_count(part).sum()) if hasattr(np, "bitwise_count") else _bits(part) for part in (rows,)))
-    every = max(total // (40 * MOST_SOLID), 1)
-    points, normals, count = _border(table, rows, where, np.array(size, np.int64), every)
-    points, normals = points[:count], normals[:count]
-    if not count:
-        return np.zeros((0, 3))
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    points = points[((points - centre) * normals).sum(axis=1) > 0.0]
-    if len(points) > MOST_SOLID:
-        points = points[np.linspace(0, len(points) - 1, MOST_SOLID).astype(np.int64)]
-    return points.astype(np.float64)
-
-
-def _bits(rows: np.ndarray) -> int:
-    return int(np.unpackbits(np.ascontiguousarray(rows).view(np.uint8)).sum())
-
-
-@numba.njit(cache=True, inline="always")
-def _is_core(table, rows, i, j, k):
-    if k < 0 or k // BRICK >= table.shape[2]:
-        return False
-    return (_row(table, rows, i, j, k // BRICK) >> np.uint64(k % BRICK)) & np.uint64(1) > 0
-
-
-@numba.njit(cache=True)
-def _border(table, rows, where, size, every):
-    """Core voxels with a free neighbour, thinned by `every`, and the direction in which the body ends there."""
-    room = 4096
-    points, normals = np.empty((room, 3), np.float32), np.empty((room, 3), np.float32)
-    count = seen = 0
-    for n in range(len(where)):
-        for i in range(BRICK):
-            for j in range(BRICK):
-                row = rows[table[where[n, 0], where[n, 1], where[n, 2]], i, j]
-                if row == 0:
-                    continue
-                for k in range(BRICK):
-                    if not (row >> np.uint16(k)) & 1:
-                        continue
-                    x, y, z = BRICK * where[n, 0] + i, BRICK * where[n, 1] + j, BRICK * where[n, 2] + k
-                    if min(x, y, z) < 2 or x > size[0] - 3 or y > size[1] - 3 or z > size[2] - 3:
-                        continue
-                    free = (
-                        not _is_core(table, rows, x - 1, y, z)
-                        or not _is_core(table, rows, x + 1, y, z)
-                        or not _is_core(table, rows, x, y - 1, z)
-                        or not _is_core(table, rows, x, y + 1, z)
-                        or not _is_core(table, rows, x, y, z - 1)
-                        or not _is_core(table, rows, x, y, z + 1)
-                    )
-                    if not free:
-                        continue
-                    seen += 1
-                    if seen % every:
-                        continue
-                    nx = ny = nz = 0.0
-                    for a in range(-2, 3):
-                        for b in range(-2, 3):
-                            for c in range(-2, 3):
-                                if not _is_core(table, rows, x + a, y + b, z + c):
-                                    nx, ny, nz = nx + a, ny + b, nz + c
-                    if count == room:
-                        room *= 2
-                        more_points, more_normals = np.empty((room, 3), np.float32), np.empty((room, 3), np.float32)
-                        more_points[:count], more_normals[:count] = points, normals
-                        points, normals = more_points, more_normals
-                    points[count, 0], points[count, 1], points[count, 2] = x, y, z
-                    normals[count, 0], normals[count, 1], normals[count, 2] = nx, ny, nz
-                    count += 1
-    return points, normals, count
 
 
 def _kept(table: np.ndarray, bricks: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import ndimage, special
 
 from ct2hair_addon.volume.structure import (
     BLOB_VARIANCE,
@@ -20,7 +20,9 @@ from ct2hair_addon.volume.structure import (
     bump,
     cut_block,
     find_peaks,
+    flat_limit,
     local_mean,
+    ripple,
     smoothed,
 )
 from ct2hair_addon.volume.thresholds import LINE_DIRECTIONS
@@ -146,3 +148,22 @@ def test_a_bump_is_a_knot_on_the_skin_and_neither_the_skin_nor_a_strand_on_it():
     assert with_knot == pytest.approx(height / BLOB_VARIANCE, rel=0.35)
     assert abs(strongest(skin)) < 0.02 * with_knot
     assert strongest(skin + strand) < 0.12 * with_knot
+
+
+def test_a_material_and_its_edge_are_flat_and_a_bundle_is_not():
+    at = np.arange(24) - 12.0
+    x, y, _ = np.meshgrid(at, at, at, indexing="ij")
+    edge = special.ndtr((0.6 * x + 0.8 * y) / STRAND_BLUR).astype(np.float32)
+    slope = smoothed(edge, TAPS)
+    assert ripple(slope, 9, 9, 9) < 0.2 * flat_limit(0.4)
+    assert ripple(np.ones((18, 18, 18), np.float32), 9, 9, 9) == 0.0
+    random = np.random.default_rng(3)
+    lines = sum(np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / STRAND_BLUR**2) for u, v in random.uniform(-14, 14, (1400, 2)))
+    bundle = smoothed(lines.astype(np.float32), TAPS)
+    assert bundle.mean() > 7.0
+    found = [ripple(bundle, i, j, 9) for i in range(4, 14) for j in range(4, 14)]
+    assert np.quantile(found, 0.02) > flat_limit(0.4) and np.median(found) > 1.5 * flat_limit(0.4)
+
+
+def test_coarse_scans_have_rougher_bodies():
+    assert flat_limit(0.1) == flat_limit(0.8) < flat_limit(1.0) < flat_limit(2.0) == flat_limit(5.0)

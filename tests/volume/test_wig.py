@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from ct2hair_addon.errors import ScanError
 from ct2hair_addon.evaluation import render_density, strand_peak, synthesize
 from ct2hair_addon.settings import ScanSettings
+from ct2hair_addon.strands import Strands, concatenate
 from ct2hair_addon.volume import Thresholds, find_thresholds, import_scan, open_scan, wig, write_scan
 
 SPACING = 0.7
@@ -176,6 +177,47 @@ def test_without_a_mannequin_nothing_is_cleared_and_blobs_are_the_knots(scan, pi
     values = found.density.block((0, 0, 0), hair.shape)
     kept = values != 0
     np.testing.assert_array_equal(values[kept], hair[kept] - np.float32(1000.0))
+
+
+@pytest.fixture(scope="module")
+def tail(spikes):
+    """Lone strands, and a tail on the ball's top, 24 mm thick and eight times as dense: over the mannequin's threshold."""
+    random = np.random.default_rng(7)
+    across = random.uniform(-12.0, 12.0, (2100, 2))
+    across = across[np.hypot(*across.T) < 12.0].astype(np.float32)
+    along = np.linspace(RADIUS + 0.5, RADIUS + 70.0, 40, dtype=np.float32)
+    points = np.concatenate(
+        [np.repeat(across[:, None], len(along), axis=1), np.tile(along[:, None], (len(across), 1, 1))], axis=2
+    )
+    return concatenate([Strands(spikes.points, spikes.offsets), Strands.from_array(points)])
+
+
+def of_tail(points, low, high):
+    return points[(np.hypot(points[:, 0], points[:, 1]) < 10.0) & (points[:, 2] > low) & (points[:, 2] < high)]
+
+
+@pytest.mark.parametrize("mannequin", ["shell", "none"])
+def test_hair_as_dense_as_the_mannequin_is_no_body(mannequin, tail, ball, tmp_path):
+    made = synthesize(tail, ball, tmp_path / "scan.nrrd", SPACING, mannequin=mannequin, seed=8)
+    with open_scan(made.files["scan"]) as reader:
+        thresholds = find_thresholds(reader, ScanSettings())
+        found = import_scan(reader, thresholds)
+    assert (thresholds.solid is None) == (mannequin == "none")
+    high = found.density.sample(of_tail(made.truth.points, RADIUS + 6.0, RADIUS + 68.0))
+    assert np.quantile(high, 0.3) > 773.0, "the tail should be as dense as a mannequin"
+    assert np.mean(high == 0.0) < 0.002
+    # and the wall is gone under it, too
+    under = of_tail(made.truth.points, RADIUS, RADIUS + 1.0) - [0.0, 0.0, 2.5]
+    assert mannequin == "none" or np.mean(found.density.sample(under) == 0.0) > 0.99
+
+
+def test_a_mannequins_level_that_is_set_decides_alone(tail, ball, tmp_path):
+    settings = ScanSettings(solid=1500.0)
+    made = synthesize(tail, ball, tmp_path / "scan.nrrd", SPACING, seed=8)
+    with open_scan(made.files["scan"], settings) as reader:
+        found = import_scan(reader, find_thresholds(reader, settings))
+    high = found.density.sample(of_tail(made.truth.points, RADIUS + 6.0, RADIUS + 68.0))
+    assert np.mean(high == 0.0) > 0.5
 
 
 def test_a_level_for_a_mannequin_that_is_not_there_is_a_warning(piece, tmp_path):
