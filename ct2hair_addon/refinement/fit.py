@@ -16,7 +16,7 @@ from ..strands import Strands
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
-from .curves import eased, easing_lengths, mean_curvature, segment_lengths
+from .curves import crowding, eased, easing_lengths, mean_curvature, segment_lengths
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -79,8 +79,9 @@ def fit_to_volume(
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
     points = np.array(points, np.float64)
     strands = Strands(points.astype(np.float32), offsets)
-    bends = STIFF_TURN / np.maximum(mean_curvature(strands, density.spacing), 1e-6)
-    noise = easing_lengths(strands, density.spacing)
+    crowded = crowding(strands, density, profile.peak)
+    bends = STIFF_TURN / np.maximum(mean_curvature(strands, density.spacing, crowded), 1e-6)
+    noise = easing_lengths(strands, density.spacing, crowded)
     rest_lengths = segment_lengths(points, offsets)
     levels = pyramid(density, profile.blur, settings.coarsest)
     plan = shares(settings.iterations, len(levels))

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from ..progress import Progress, part, silent
-from ..volume import BrickVolume
+from ..volume import BRICK, BrickVolume
 from ..volume.grid import trilinear
 from ..volume.strand_signal import StrandProfile, add_strand
 from .splat import CHUNK, blurred, cubic, render, segment_samples
@@ -21,6 +21,10 @@ LEAST_EARNED = 8.0
 """voxel; a strand that earns less than so much of a lone strand's length is left out."""
 LEAST_CUT = 6.0
 """voxel; a tip is cut only where that earns as much."""
+BARE = 0.4
+"""The scan shows no hair where it stays below this share of a lone strand's peak."""
+BARE_COST = 1.0
+"""What a stretch where the scan shows no hair costs beside its misfit: amid dense hair any strand earns something."""
 RING = 1.0
 """voxel; the misfit is read on the centre line and on four points this far from it."""
 
@@ -59,14 +63,16 @@ def prune(
     wide = blur**2 + 1.0 / 6.0
     seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
     earned = np.empty(len(counts))
-    _earn(density.table, excess, voxels, offsets, visible, peak, seen, earned)
+    bare = 0.0 if reach else BARE * gain / (2.0 * np.pi * blur**2)
+    _earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, peak, seen, earned)
     progress(0.8, 1.0)
     order = np.argsort(earned, kind="stable")
     step = 2000
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
         _cut(
-            density.table, excess, voxels, offsets, visible, order[start : start + step], peak, seen, blur, kept
+            density.table, excess, density.bricks, bare, voxels, offsets, visible, order[start : start + step], peak, seen,
+            blur, kept,
         )  # fmt: skip
     progress(1.0, 1.0)
     gone = int(np.count_nonzero((kept == 0) & (counts > 0)))
@@ -99,7 +105,16 @@ def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
 
 
 @numba.njit(cache=True, nogil=True)
-def _prefix(table, excess, points, visible, start, end, peak, seen, earned):
+def _is_stored(table, x, y, z):
+    i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
+    if i < 0 or j < 0 or k < 0:
+        return False
+    i, j, k = i // BRICK, j // BRICK, k // BRICK
+    return i < table.shape[0] and j < table.shape[1] and k < table.shape[2] and table[i, j, k] >= 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned):
     """Fill `earned` (end - start,) with what the strand earns up to each of its control points."""
     total = 0.0
     earned[0] = 0.0
@@ -120,32 +135,36 @@ def _prefix(table, excess, points, visible, start, end, peak, seen, earned):
             shown = (1.0 - t) * visible[m] + t * visible[m + 1]
             if length > 0.0 and shown > 0.0:
                 x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
-                a = _amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
+                a = 1.0  # where nothing is stored, nothing is rendered: the strand is one too many
+                if _is_stored(table, x, y, z):
+                    a = _amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
                 total += shown * length * (0.5 - min(max(a, -1.0), 2.0))
+                if bare > 0.0 and trilinear(table, scan, np.float32(0.0), x, y, z) < bare:
+                    total -= shown * length * BARE_COST
             px, py, pz = qx, qy, qz
         earned[m + 1 - start] = total
 
 
 @numba.njit(cache=True, parallel=True)
-def _earn(table, excess, points, offsets, visible, peak, seen, out):
+def _earn(table, excess, scan, bare, points, offsets, visible, peak, seen, out):
     for n in numba.prange(len(out)):
         size = offsets[n + 1] - offsets[n]
         out[n] = 0.0
         if size > 1:
             earned = np.empty(size)
-            _prefix(table, excess, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
+            _prefix(table, excess, scan, bare, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
             out[n] = earned[size - 1]
 
 
 @numba.njit(cache=True, nogil=True)
-def _cut(table, excess, points, offsets, visible, order, peak, seen, blur, kept):
+def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen, blur, kept):
     for n in order:
         start, end = offsets[n], offsets[n + 1]
         size = end - start
         if size < 2:
             continue
         earned = np.empty(size)
-        _prefix(table, excess, points, visible, start, end, peak, seen, earned)
+        _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned)
         best = 0
         for m in range(size):
             if earned[m] > earned[best]:

@@ -13,7 +13,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import control_points, eased, easing_lengths, polylines
+from .curves import control_points, crowding, eased, easing_lengths, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
@@ -66,7 +66,7 @@ def refine(
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     eases = settings.iterations and settings.method == "volume"
-    points, offsets = control_points(_eased(kept, density.spacing) if eases else kept, settings.points)
+    points, offsets = control_points(_eased(kept, density, profile) if eases else kept, settings.points)
     first = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
@@ -101,10 +101,12 @@ def refine(
     return Refined(result, tally, {"before": before, "after": after})
 
 
-def _eased(strands: Strands, voxel: float) -> Strands:
-    """The strands, points a voxel (mm) apart, without the noise of tracing."""
+def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> Strands:
+    """The strands, points a voxel apart, without the noise of tracing."""
+    voxel = density.spacing
     even = strands.resampled_by_step(voxel)
-    points = eased(even.points, even.offsets, easing_lengths(strands, voxel), voxel)
+    crowded = crowding(strands, density, profile.peak)
+    points = eased(even.points, even.offsets, easing_lengths(strands, voxel, crowded), voxel, crowded)
     return Strands(points.astype(np.float32), even.offsets)
 
 
