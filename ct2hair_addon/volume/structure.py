@@ -32,8 +32,9 @@ RIPPLE_REACH = 2
 FLAT = 0.025
 """A body's material ripples less than this. A noisy mannequin has 0.006 at 0.4 mm; a tail of hair so dense that it reaches the
 mannequin's values has 0.06, and over 0.024 in 99 places of 100."""
-FLAT_SPACING = 0.8
-"""mm. In coarser scans a mannequin's wall is so few voxels thick that half of it ripples by 0.03 (at 1.2 mm)."""
+FLAT_SPACING, BLURRED_SPACING = 0.8, 1.4
+"""mm. In coarser scans a mannequin's wall is so few voxels thick that half of it ripples by 0.03 (at 1.2 mm), and from the
+second on ripple tells nothing."""
 MOST_PEAKS = 8192
 """Peaks of a block of 48^3 voxels that are noted."""
 
@@ -219,8 +220,8 @@ def bump(smooth, a, b, c):
 
 
 def flat_limit(spacing: float) -> float:
-    """The ripple below which a scan of `spacing` mm shows a body's material and no hair."""
-    return FLAT * min(max(spacing / FLAT_SPACING, 1.0), 1.6)
+    """The ripple below which a scan of `spacing` mm shows a body's material and no hair; infinite where that can't be told."""
+    return FLAT * max(spacing / FLAT_SPACING, 1.0) if spacing < BLURRED_SPACING else float("inf")
 
 
 @numba.njit(cache=True, nogil=True)

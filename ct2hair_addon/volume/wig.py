@@ -174,7 +174,7 @@ def import_scan(
 class _Levels:
     """Densities above air: strand-like contrast, knots (smoothed), the mannequin's core; float32. solid is huge for none.
 
-    flat: the ripple that the mannequin stays below; huge where the settings give the mannequin's level, which then decides.
+    flat: the ripple that the mannequin stays below; infinite where the settings give the mannequin's level, which then decides.
     """
 
     air: np.float32
@@ -192,7 +192,7 @@ class _Levels:
             contrast = LINE_SHARE * (thresholds.hair - thresholds.air)
         knots = LINE_SHARE * (thresholds.knots - thresholds.air)
         solid = thresholds.solid - thresholds.air if thresholds.solid is not None else 3e38
-        flat = 3e38 if "solid" in thresholds.chosen else flat_limit(spacing)
+        flat = np.inf if "solid" in thresholds.chosen else flat_limit(spacing)
         return cls(*(np.float32(value) for value in (thresholds.air, contrast, knots, solid, flat)))
 
 
