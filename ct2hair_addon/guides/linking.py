@@ -244,9 +244,9 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     kept = cost < LOOSE_END
     one, other = one[kept], other[kept]
     sign = np.where((one < count) == (other < count), -1.0, 1.0)
-    tip, root, _, healed = _healed(lines, onward, density, strand)
-    pairs = np.stack([np.append(one % count, tip), np.append(other % count, root)], axis=1)
-    return pairs, np.append(sign, np.ones(len(tip))), np.append(cost[kept], healed)
+    pair, _, healed = _healed(lines, onward, density, strand)
+    pairs = np.stack([np.append(one % count, pair // count), np.append(other % count, pair % count)], axis=1)
+    return pairs, np.append(sign, np.ones(len(pair))), np.append(cost[kept], healed)
 
 
 def _courses(lines: Strands, from_root: bool, cut: float, voxel: float):
@@ -313,7 +313,7 @@ def _candidates(
 ) -> _Joints:
     """All joints worth weighing, the cheapest for each pair; those that heal a cut leave nothing off."""
     voxel, count = density.spacing, len(lines)
-    found = [_healed(lines, onward, density, strand)]
+    best = _healed(lines, onward, density, strand)
     number, steps = 0, len(CUTS) ** 2
     for root_cut in CUTS:
         root_valid, root_place, root_out, root_bend = _courses(lines, True, root_cut, voxel)
@@ -339,9 +339,8 @@ def _candidates(
                     row, column = np.nonzero(near < len(targets))
                     pairs.append(tips[row].astype(np.int64) * count + targets[near[row, column]])
             pair = np.unique(np.concatenate(pairs))
+            pair = pair[(pair // count != pair % count) & (onward[pair // count] != pair % count)]
             tip, root = pair // count, pair % count
-            kept = (tip != root) & (onward[tip] != root)
-            tip, root = tip[kept], root[kept]
             cost = np.empty(len(tip))
             _weigh(
                 tip, root, place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
@@ -349,19 +348,31 @@ def _candidates(
             )  # fmt: skip
             cost += PER_CUT * (cut + root_cut)
             kept = cost < LOOSE_END
-            left = np.broadcast_to([round(cut / STEP), round(root_cut / STEP)], (int(kept.sum()), 2))
-            found.append((tip[kept], root[kept], left, cost[kept]))
-    tip, root, cut, cost = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    order = np.lexsort((cut.sum(axis=1), cost, root, tip))
-    tip, root, cut, cost = tip[order], root[order], cut[order], cost[order]
-    first = np.ones(len(tip), bool)
-    first[1:] = (tip[1:] != tip[:-1]) | (root[1:] != root[:-1])
-    tip, root, cut, cost = tip[first], root[first], cut[first], cost[first]
-    return _Joints(tip, root, cut, cost)
+            left = np.full((int(kept.sum()), 2), (round(cut / STEP), round(root_cut / STEP)), np.int16)
+            best = _cheaper(best, (pair[kept], left, cost[kept]))
+    pair, cut, cost = best
+    return _Joints(pair // count, pair % count, cut, cost)
+
+
+def _cheaper(best, more):
+    """Two lots of joints (pairs, ascending, each once; cut; cost) as one: of a pair that both have, the cheaper, else the first
+
+    Lot by lot, memory holds each pair once.
+    """
+    pair, cut, cost = best
+    if not len(pair):
+        return more
+    place = np.minimum(np.searchsorted(pair, more[0]), len(pair) - 1)
+    known = pair[place] == more[0]
+    won = np.flatnonzero(known)[more[2][known] < cost[place[known]]]
+    cut[place[won]], cost[place[won]] = more[1][won], more[2][won]
+    pair = np.concatenate([pair, more[0][~known]])
+    order = np.argsort(pair, kind="stable")
+    return pair[order], np.concatenate([cut, more[1][~known]])[order], np.concatenate([cost, more[2][~known]])[order]
 
 
 def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: float):
-    """The joints that heal a cut, weighed by how the courses at some distance to both sides of it meet."""
+    """The joints that heal a cut (pairs, cut, cost), weighed by how the courses at some distance to both sides of it meet."""
     voxel = density.spacing
     tip = np.flatnonzero(onward >= 0)
     root = onward[tip]
@@ -375,7 +386,7 @@ def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: fl
         density.origin / voxel, np.float32(strand), some,
     )  # fmt: skip
     cost[both] = np.clip(some - PER_VOXEL * 2.0 * ACROSS, 0.0, 0.9 * LOOSE_END)
-    return tip, root, np.zeros((len(tip), 2), np.int64), cost
+    return tip * len(lines) + root, np.zeros((len(tip), 2), np.int16), cost
 
 
 @numba.njit(cache=True, parallel=True)
