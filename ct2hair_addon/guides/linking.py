@@ -355,7 +355,7 @@ def _candidates(
 
 
 def _cheaper(best, more):
-    """Two lots of joints (pairs, ascending, each once; cut; cost) as one: of a pair that both have, the cheaper, else the first
+    """Two lots of joints (pairs, ascending, each once; cut; cost) as one; of a pair in both, the cheaper, else the first's.
 
     Lot by lot, memory holds each pair once.
     """
