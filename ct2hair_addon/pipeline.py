@@ -165,7 +165,7 @@ class _Job:
         wig = dataclasses.replace(wig, density=density)  # the net's voxels are needed no more
         if self.until == "head":
             return self._stop(wig, registration)
-        guides = self._guides(density, level, head)
+        guides = self._guides(density, level, head, wig.knots)
         if self.until == "guides":
             return self._stop(wig, registration, guides=guides.strands)
 
@@ -224,7 +224,7 @@ class _Job:
         save_vdb(wig.density, self.out / "volume.vdb")
         return wig
 
-    def _guides(self, density: BrickVolume, level: float, head: Head) -> Guides:
+    def _guides(self, density: BrickVolume, level: float, head: Head, knots: np.ndarray) -> Guides:
         """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
@@ -235,7 +235,7 @@ class _Job:
         guides = self._stage(
             "guides",
             lambda progress: trace_guides(
-                density, level, field, head, self.settings.guides, self.settings.run.seed, progress=progress
+                density, level, field, head, self.settings.guides, self.settings.run.seed, progress, knots
             ),
             guides,
         )

@@ -51,7 +51,11 @@ class HeadSettings:
         unit="mm",
     )
     net_clearance: float = parameter(
-        1.5, "hair voxels closer to the scalp than this are taken for the hairnet", unit="mm", low=0.0, high=10.0
+        0.0,
+        "hair voxels closer to the scalp than this are taken for the hairnet; 0: 0.5 and the scan's blur, 1.5 at most",
+        unit="mm",
+        low=0.0,
+        high=10.0,
     )
 
 
@@ -91,6 +95,7 @@ class GuideSettings:
         75.0, "largest angle to the scalp's normal at a root (tau_a)", unit="degrees", low=1.0, high=90.0
     )
     link: bool = parameter(True, "segments are joined into whole strands before they are grown")
+    knots: bool = parameter(True, "roots are led to the hairnet's knots, where hair is tied, as far as the scan shows them")
     min_support: float = parameter(
         0.15, "a strand of which less than this share was traced in the scan is dropped", low=0.0, high=1.0
     )

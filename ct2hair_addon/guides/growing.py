@@ -10,6 +10,7 @@ from ..head import Head
 from ..settings import GuideSettings
 from ..strands import Strands, offsets_from_counts
 from .direction import end_tangents
+from .knots import tie_to_knots
 
 REACHES = (1.0, 2.0, 4.0)
 """Multiples of the neighbour radius that are tried in turn: the nearest hair first, thin places last."""
@@ -95,22 +96,26 @@ def _guides_for(ends, tangents, forest, reach):
     return source, place, np.isfinite(best)
 
 
-def lead_into_scalp(strands: Strands, head: Head) -> tuple[Strands, np.ndarray]:
+def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = None) -> tuple[Strands, np.ndarray, int]:
     """Put a curve before each strand that runs from the scalp into its first point's direction; returns (strands, (N,) mm
-    added).
+    added, roots at knots).
 
-    The root lies where the hair, followed straight back, would come closest to the scalp; the curve is a cubic Hermite piece
-    that
-    leaves the scalp leaning to its normal. A first point already on the scalp or in the head is moved there.
+    The root lies where the hair, followed straight back, would come closest to the scalp, or at the knot by there, if there is
+    one among `knots` (K, 3), mm (`tie_to_knots`); the curve is a cubic Hermite piece that leaves the scalp
+    leaning to its normal. A first point already on the scalp or in the head is moved there.
     """
     if not len(strands):
-        return strands, np.zeros(0, np.float32)
+        return strands, np.zeros(0, np.float32), 0
     forward, _ = end_tangents(strands)
     ends = strands.roots.astype(np.float64)
     near = head.closest_scalp(ends)
     depth = np.maximum(head.signed_distance(ends), 0.0).astype(np.float64)
     steep = np.clip((near.normal * forward).sum(axis=1), 0.35, 1.0)
     root = head.closest_scalp(ends - forward * (depth / steep)[:, None])
+    tied = np.zeros(len(strands), bool)
+    if knots is not None:
+        place, tied = tie_to_knots(root.position, forward, head, knots)
+        root = head.closest_scalp(place)
     gap = np.linalg.norm(root.position - ends, axis=1)
     leaving = forward + 0.7 * root.normal
     leaving /= np.maximum(np.linalg.norm(leaving, axis=1, keepdims=True), 1e-9)
@@ -123,7 +128,7 @@ def lead_into_scalp(strands: Strands, head: Head) -> tuple[Strands, np.ndarray]:
     curve += (3 * t**2 - 2 * t**3) * end + (t**3 - t**2) * pull * forward[index]
     joined = _joined(curve.astype(np.float32), offsets, strands.points, strands.offsets)
     lead = Strands(joined, offsets_from_counts(counts + strands.counts), strands.strand_attributes)
-    return lead, gap.astype(np.float32)
+    return lead, gap.astype(np.float32), int(tied.sum())
 
 
 @numba.njit(cache=True)

@@ -448,7 +448,7 @@ def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
     if not len(joints.cost):
         return following, cut
     starts = np.searchsorted(joints.tip, np.arange(count + 1))
-    _assign(starts, joints.root, joints.cost, LOOSE_END, following)
+    assign(starts, joints.root, joints.cost, LOOSE_END, following)
     tip = np.flatnonzero(following >= 0)
     root = following[tip]
     key = joints.tip * count + joints.root
@@ -458,7 +458,7 @@ def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(cache=True)
-def _assign(starts, columns, costs, loose, chosen):
+def assign(starts, columns, costs, loose, chosen):
     """Fill `chosen` (R,): each row's column, or -1, at the least sum of costs, `loose` for a row without one.
 
     Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`. Shortest augmenting paths over reduced costs

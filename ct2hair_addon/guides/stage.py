@@ -80,12 +80,13 @@ def trace_guides(
     settings: GuideSettings | None = None,
     seed: int = 0,
     progress: Progress = silent,
+    knots: np.ndarray | None = None,
 ) -> Guides:
     """Guide strands of the hair in `density` (air at 0, hair above `hair_level`) on `head`.
 
     Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, the poor ones
-    grown along rooted
-    neighbours, each root led into the scalp, no point left inside the head. With `settings.method` "paper" all of it goes the
+    grown along rooted neighbours, each root led into the scalp, to a knot (`knots` (K, 3), mm) where there is one by it, no
+    point left inside the head. With `settings.method` "paper" all of it goes the
     paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
@@ -95,7 +96,7 @@ def trace_guides(
         return Guides(strands, _profile(density, hair_level, *seeds), tally)
     segments, profile, tally = find_segments(density, hair_level, field, settings, seed, part(progress, 0.0, 0.85))
     strands, more = root_segments(
-        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen
+        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen, knots=knots
     )
     progress(1, 1)
     return Guides(strands, profile, tally | more)
@@ -109,10 +110,12 @@ def root_segments(
     progress: Progress = silent,
     scan: BrickVolume | None = None,
     strand: float = 0.0,
+    knots: np.ndarray | None = None,
 ) -> tuple[Strands, dict[str, int]]:
     """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; and what became of them.
 
     scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
+    knots: (K, 3) mm, where strands are tied to the net.
     """
     tally: dict[str, int] = {}
     fine = fine_ends(segments, head, settings)
@@ -140,7 +143,8 @@ def root_segments(
     enough = reached & (backed >= settings.min_support)
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
-    rooted, _ = lead_into_scalp(kept, head)
+    rooted, _, tied = lead_into_scalp(kept, head, knots if settings.knots else None)
+    tally["roots at knots of the net"] = tied
     progress(0.85, 1.0)
     rooted, pushed = push_out(rooted, head)
     rooted = rooted.resampled_by_step(_step(spacing))

@@ -19,14 +19,25 @@ surface of radius R, 0.01 mm on a scalp."""
 BRICKS_A_CALL = 1024
 """Bricks of one kernel call: well under a second."""
 
+NET_HEIGHT, NET_BLUR = 0.5, 1.5
+"""mm, and voxel: how high a net's threads lie over the scalp, and how far the scan's blur carries them (1.8 sigma)."""
+CLEARANCES = (0.8, 1.5)
+"""mm; the least and the most that is cleared where the settings give no number."""
+
 UNTOUCHED, TOUCHED, INSIDE = 0, 1, 2
+
+
+def clearance(spacing: float, settings: HeadSettings) -> float:
+    """mm over the scalp that are cleared in a scan of `spacing` mm: `settings.net_clearance`, or what a net takes there."""
+    low, high = CLEARANCES
+    return float(settings.net_clearance or min(max(NET_HEIGHT + NET_BLUR * spacing, low), high))
 
 
 def remove_hairnet(
     density: BrickVolume, head: Head, settings: HeadSettings, progress: Progress = silent
 ) -> tuple[BrickVolume, dict[str, int]]:
-    """`density` (scan frame) with the voxels inside `head`, and those nearer to its scalp than `settings.net_clearance`, set
-    to the background; bricks that end empty are dropped. Returns it with the counts of what was removed."""
+    """`density` (scan frame) with the voxels inside `head`, and those nearer to its scalp than `clearance`, set to the
+    background; bricks that end empty are dropped. Returns it with the counts of what was removed."""
     bricks = density.bricks.copy()
     index = density.brick_index
     background = bricks.dtype.type(density.background)
@@ -43,7 +54,7 @@ def remove_hairnet(
             background,
             density.spacing,
             density.origin,
-            float(settings.net_clearance),
+            clearance(density.spacing, settings),
             size,
             solid.boxes,
             solid.child,

@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from ct2hair_addon.evaluation import render_density, strand_peak
-from ct2hair_addon.guides.linking import _assign, cut_segments, link_segments, meeting_ends
+from ct2hair_addon.guides.linking import assign, cut_segments, link_segments, meeting_ends
 from ct2hair_addon.strands import Strands
 
 SPACING, BLUR = 0.4, 0.85
@@ -43,7 +43,7 @@ def test_the_assignment_is_the_cheapest(rows, seed):
     row, column = key // rows, key % rows
     cost = generator.uniform(0, 30, len(key))
     chosen = np.full(rows, -1, np.int64)
-    _assign(np.searchsorted(row, np.arange(rows + 1)), column, cost, loose, chosen)
+    assign(np.searchsorted(row, np.arange(rows + 1)), column, cost, loose, chosen)
     has = np.flatnonzero(chosen >= 0)
     assert len(np.unique(chosen[has])) == len(has)
     found = cost[np.searchsorted(key, has * rows + chosen[has])].sum() + loose * (rows - len(has))

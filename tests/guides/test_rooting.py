@@ -73,7 +73,8 @@ def test_growing_follows_the_neighbours_in_rounds(ball):
 
 def test_the_lead_starts_on_the_scalp_and_goes_on_smoothly(ball):
     strands = Strands.from_polylines([hair(a, 6, 60) for a in np.linspace(0, 6, 40)])
-    led, added = lead_into_scalp(strands, ball)
+    led, added, tied = lead_into_scalp(strands, ball)
+    assert tied == 0
     assert ball.closest_scalp(led.roots).distance.max() < 1e-3
     assert (added > 4).all() and (added < 12).all()
     for line in led.resampled_by_step(1.0).polylines():

@@ -1,0 +1,76 @@
+"""Roots led to the net's knots: each knot to one root, the usual miss learned, roots without a knot left about right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ct2hair_addon.guides.growing import lead_into_scalp
+from ct2hair_addon.guides.knots import tie_to_knots
+from ct2hair_addon.head import Head
+from ct2hair_addon.strands import Strands
+
+BEHIND = 1.1
+
+
+@pytest.fixture(scope="module")
+def ball(make_ball) -> Head:
+    return Head(make_ball(80.0, rings=90, sides=120))
+
+
+@pytest.fixture(scope="module")
+def tied_hair(ball):
+    """(knots, where their hair was followed back to, its directions): 400 knots some 3 mm apart on the ball's scalp."""
+    random = np.random.default_rng(5)
+    radius = float(np.linalg.norm(ball.mesh.vertices[0]))
+    count = 4 * int(2 * np.pi * radius**2 / 9.0)
+    golden = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    height = 1.0 - (np.arange(count) + 0.5) / count * 0.5
+    knots = radius * np.stack(
+        [np.sqrt(1 - height**2) * np.cos(golden), np.sqrt(1 - height**2) * np.sin(golden), height], axis=1
+    )
+    knots = ball.closest_scalp(knots[random.permutation(count)[: count // 4]]).position.astype(float)
+    normal = ball.closest_scalp(knots).normal.astype(float)
+    along = np.cross(normal, [0.0, 1.0, 0.0])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(normal, along)
+    miss = random.normal(size=(len(knots), 2)) * [0.25, 0.15]
+    found = knots - (BEHIND + miss[:, :1]) * along + miss[:, 1:] * across
+    forward = 0.87 * along + 0.5 * normal
+    return knots, ball.closest_scalp(found).position.astype(float), forward
+
+
+def test_roots_go_to_their_own_knots(ball, tied_hair):
+    knots, found, forward = tied_hair
+    roots, tied = tie_to_knots(found, forward, ball, knots)
+    assert tied.mean() > 0.98
+    off = np.linalg.norm(roots - knots, axis=1)
+    assert np.mean(off < 0.05) > 0.93, "most should find the knot that they were drawn from"
+    assert len(np.unique(roots[tied].round(3), axis=0)) == tied.sum(), "a knot ties one strand"
+
+
+def test_roots_without_a_knot_take_what_the_others_missed(ball, tied_hair):
+    knots, found, forward = tied_hair
+    seen = np.random.default_rng(1).permutation(len(knots))[: int(0.6 * len(knots))]
+    roots, tied = tie_to_knots(found, forward, ball, knots[seen])
+    alone = ~tied
+    assert 0.2 < alone.mean() < 0.5
+    before, after = (np.median(np.linalg.norm(some[alone] - knots[alone], axis=1)) for some in (found, roots))
+    assert after < 0.6 * before
+
+
+@pytest.mark.parametrize("knots", [np.zeros((0, 3)), np.full((5, 3), 400.0)])
+def test_without_knots_by_the_scalp_nothing_moves(knots, ball, tied_hair):
+    _, found, forward = tied_hair
+    roots, tied = tie_to_knots(found, forward, ball, knots)
+    np.testing.assert_array_equal(roots, found)
+    assert not tied.any()
+
+
+def test_the_lead_starts_at_the_knot(ball, tied_hair):
+    knots, _, forward = tied_hair
+    knot, way = knots[:1], forward[:1]
+    line = knot + 1.2 * ball.closest_scalp(knot).normal + np.linspace(0.0, 40.0, 40)[:, None] * way
+    led, _, tied = lead_into_scalp(Strands.from_polylines([line]), ball, knot)
+    assert tied == 1
+    np.testing.assert_allclose(led.roots, knot, atol=0.02)
