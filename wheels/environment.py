@@ -69,6 +69,7 @@ def check_blender(folder: Path) -> None:
         [str(folder / "bin" / "python"), "-c", "import bpy; print(bpy.app.version_string)"],
         capture_output=True,
         encoding="utf-8",
+        errors="replace",
         check=False,
     )
     if done.returncode:

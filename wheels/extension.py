@@ -81,7 +81,11 @@ def blender_extension(*arguments: str) -> None:
     if not tools:
         raise LockError("Blender's extension tool comes with bpy, which this Python doesn't have; run `make setup`")
     done = subprocess.run(
-        [sys.executable, str(tools[-1]), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
+        [sys.executable, str(tools[-1]), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        encoding="utf-8",
+        errors="replace",
     )
     if done.returncode:
         raise LockError(f"Blender's extension tool refused to {arguments[0]}:\n{done.stdout}")

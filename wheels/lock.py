@@ -144,6 +144,7 @@ def pip(*arguments: str, python: str = sys.executable, quiet: bool = False) -> N
         stdout=subprocess.DEVNULL if quiet else None,
         stderr=subprocess.PIPE,
         encoding="utf-8",
+        errors="replace",
     )
     if done.returncode:
         errors = [line for line in done.stderr.splitlines() if not line.startswith("WARNING")]

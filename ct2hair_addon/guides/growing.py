@@ -114,7 +114,7 @@ def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = Non
     root = head.closest_scalp(ends - forward * (depth / steep)[:, None])
     tied = np.zeros(len(strands), bool)
     if knots is not None:
-        place, tied = tie_to_knots(root.position, forward, head, knots)
+        place, tied = tie_to_knots(root, forward, head, knots)
         root = head.closest_scalp(place)
     gap = np.linalg.norm(root.position - ends, axis=1)
     leaving = forward + 0.7 * root.normal

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..head import Head
+from ..head import Head, ScalpPoints
 from .linking import assign
 
 HEIGHT = 1.0
@@ -28,34 +28,31 @@ LEAST_TIED = 0.3
 """Share of roots with a knot from which the usual miss is believed."""
 
 
-def tie_to_knots(roots: np.ndarray, forward: np.ndarray, head: Head, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tie_to_knots(found: ScalpPoints, forward: np.ndarray, head: Head, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(roots (N, 3) float64 moved to knots, each knot given to one root at most; (N,) bool which were): the cheapest choice.
 
-    roots: (N, 3) mm on the scalp, where hair that goes on in the directions `forward` (N, 3) was followed back to. knots:
-    (K, 3) mm. Roots without a knot are moved by what the others' usually missed, along their hair.
+    found: on the scalp, where hair that goes on in the directions `forward` (N, 3) was followed back to. knots: (K, 3) mm.
+    Roots without a knot are moved by what the others' usually missed, along their hair. None is put back onto the scalp.
     """
-    roots = np.array(roots, np.float64)
-    free = np.zeros(len(roots), bool)
+    roots = np.array(found.position, np.float64)
     knots = np.asarray(knots, np.float64).reshape(-1, 3)
     if len(knots):
         knots = knots[np.abs(head.signed_distance(knots)) < HEIGHT]
     if not len(knots) or not len(roots):
-        return roots, free
-    normal = head.closest_scalp(roots).normal.astype(np.float64)
+        return roots, np.zeros(len(roots), bool)
+    normal = found.normal.astype(np.float64)
     along = forward - normal * (forward * normal).sum(axis=1, keepdims=True)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     across = np.cross(normal, along)
     tree = cKDTree(knots)
-    chosen = np.full(len(roots), -1, np.int64)
     for _ in range(ROUNDS):
         chosen = _chosen(roots, along, across, knots, tree)
         tied = chosen >= 0
         if tied.mean() < LEAST_TIED:
             break
         roots += np.median(((knots[chosen[tied]] - roots[tied]) * along[tied]).sum(axis=1)) * along
-    tied = chosen >= 0
     roots[tied] = knots[chosen[tied]]
-    return head.closest_scalp(roots).position.astype(np.float64), tied
+    return roots, tied
 
 
 def _chosen(roots, along, across, knots, tree) -> np.ndarray:

@@ -24,8 +24,6 @@ NET_HEIGHT, NET_BLUR = 0.5, 1.5
 CLEARANCES = (0.8, 1.5)
 """mm; the least and the most that is cleared where the settings give no number."""
 
-UNTOUCHED, TOUCHED, INSIDE = 0, 1, 2
-
 
 def clearance(spacing: float, settings: HeadSettings) -> float:
     """mm over the scalp that are cleared in a scan of `spacing` mm: `settings.net_clearance`, or what a net takes there."""

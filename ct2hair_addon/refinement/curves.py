@@ -42,10 +42,10 @@ def crowding(strands: Strands, density: BrickVolume, peak: float) -> np.ndarray:
     return np.clip(along / (APART * max(peak, 1e-30)), 1.0, MOST_CROWDED)
 
 
-def mean_curvature(strands: Strands, voxel: float, crowded: np.ndarray | None = None) -> np.ndarray:
+def mean_curvature(strands: Strands, voxel: float, crowded: np.ndarray | float = 1.0) -> np.ndarray:
     """(N,) float64, 1/mm: how much each strand (mm) turns a length, waves of a few voxels left out; longer ones, too, where
     `crowded` (N,), as `crowding` gives it, is over 1. voxel: mm."""
-    wide = np.zeros(len(strands), bool) if crowded is None else crowded > 1.0
+    wide = np.broadcast_to(np.asarray(crowded) > 1.0, len(strands))
     turning = np.empty(len(strands))
     for some, step in ((~wide, BEND_STEP), (wide, MOST_CROWDED * BEND_STEP)):
         if some.any():
@@ -62,12 +62,10 @@ def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return lengths
 
 
-def easing_lengths(strands: Strands, voxel: float, crowded: np.ndarray | None = None) -> np.ndarray:
-    """(N,) float64, mm: below which waves of each strand (mm) are noise of tracing; 0 for curls. voxel: mm. crowded: as for
-    `mean_curvature`."""
-    more = 1.0 if crowded is None else crowded
-    length = EASED_TURN / np.maximum(mean_curvature(strands, voxel, crowded), 1e-6)
-    length = more * np.minimum(length, EASED_MOST * voxel)
+def easing_lengths(curvature: np.ndarray, voxel: float, crowded: np.ndarray | float = 1.0) -> np.ndarray:
+    """(N,) float64, mm: below which waves of strands of `mean_curvature` (N,), 1/mm, are noise of tracing; 0 for curls. voxel:
+    mm. crowded: as `crowding` gives it."""
+    length = crowded * np.minimum(EASED_TURN / np.maximum(curvature, 1e-6), EASED_MOST * voxel)
     return np.where(length < EASED_LEAST * voxel, 0.0, length)
 
 

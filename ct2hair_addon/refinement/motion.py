@@ -10,6 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from ..volume.grid import voxel
 from .splat import cubic, segment_samples
 
 
@@ -67,31 +68,20 @@ def gather_forces(points, offsets, visible, table, potential, forces, weights):
                 forces[m, axis] /= max(shown[m - start], 1e-9)
 
 
-@numba.njit(cache=True, inline="always")
-def _corner(table, bricks, i, j, k):
-    if i < 0 or j < 0 or k < 0:
-        return np.float32(0.0)
-    if (i >> 4) >= table.shape[0] or (j >> 4) >= table.shape[1] or (k >> 4) >= table.shape[2]:
-        return np.float32(0.0)
-    row = table[i >> 4, j >> 4, k >> 4]
-    if row < 0:
-        return np.float32(0.0)
-    return bricks[row, i & 15, j & 15, k & 15]
-
-
 @numba.njit(cache=True)
 def _gradient(table, bricks, x, y, z):
     """The gradient of the trilinear interpolant, per voxel; 0 is taken outside the bricks."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
-    v000 = _corner(table, bricks, i, j, k)
-    v001 = _corner(table, bricks, i, j, k + 1)
-    v010 = _corner(table, bricks, i, j + 1, k)
-    v011 = _corner(table, bricks, i, j + 1, k + 1)
-    v100 = _corner(table, bricks, i + 1, j, k)
-    v101 = _corner(table, bricks, i + 1, j, k + 1)
-    v110 = _corner(table, bricks, i + 1, j + 1, k)
-    v111 = _corner(table, bricks, i + 1, j + 1, k + 1)
+    nothing = np.float32(0.0)
+    v000 = voxel(table, bricks, nothing, i, j, k)
+    v001 = voxel(table, bricks, nothing, i, j, k + 1)
+    v010 = voxel(table, bricks, nothing, i, j + 1, k)
+    v011 = voxel(table, bricks, nothing, i, j + 1, k + 1)
+    v100 = voxel(table, bricks, nothing, i + 1, j, k)
+    v101 = voxel(table, bricks, nothing, i + 1, j, k + 1)
+    v110 = voxel(table, bricks, nothing, i + 1, j + 1, k)
+    v111 = voxel(table, bricks, nothing, i + 1, j + 1, k + 1)
     ex, ey, ez = 1.0 - fx, 1.0 - fy, 1.0 - fz
     gx = ey * (ez * (v100 - v000) + fz * (v101 - v001)) + fy * (ez * (v110 - v010) + fz * (v111 - v011))
     gy = ex * (ez * (v010 - v000) + fz * (v011 - v001)) + fx * (ez * (v110 - v100) + fz * (v111 - v101))

@@ -12,8 +12,8 @@ import numba
 import numpy as np
 
 from ..progress import Progress, part, silent
-from ..volume import BRICK, BrickVolume
-from ..volume.grid import trilinear
+from ..volume import BrickVolume
+from ..volume.grid import trilinear, voxel
 from ..volume.strand_signal import StrandProfile, add_strand
 from .splat import CHUNK, blurred, cubic, render, segment_samples
 
@@ -63,7 +63,7 @@ def prune(
     wide = blur**2 + 1.0 / 6.0
     seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
     earned = np.empty(len(counts))
-    bare = 0.0 if reach else BARE * gain / (2.0 * np.pi * blur**2)
+    bare = 0.0 if reach else BARE * peak
     _earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, peak, seen, earned)
     progress(0.8, 1.0)
     order = np.argsort(earned, kind="stable")
@@ -105,15 +105,6 @@ def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
 
 
 @numba.njit(cache=True, nogil=True)
-def _is_stored(table, x, y, z):
-    i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
-    if i < 0 or j < 0 or k < 0:
-        return False
-    i, j, k = i // BRICK, j // BRICK, k // BRICK
-    return i < table.shape[0] and j < table.shape[1] and k < table.shape[2] and table[i, j, k] >= 0
-
-
-@numba.njit(cache=True, nogil=True)
 def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned):
     """Fill `earned` (end - start,) with what the strand earns up to each of its control points."""
     total = 0.0
@@ -135,8 +126,9 @@ def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, 
             shown = (1.0 - t) * visible[m] + t * visible[m + 1]
             if length > 0.0 and shown > 0.0:
                 x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+                i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
                 a = 1.0  # where nothing is stored, nothing is rendered: the strand is one too many
-                if _is_stored(table, x, y, z):
+                if not np.isnan(voxel(table, excess, np.float32(np.nan), i, j, k)):
                     a = _amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
                 total += shown * length * (0.5 - min(max(a, -1.0), 2.0))
                 if bare > 0.0 and trilinear(table, scan, np.float32(0.0), x, y, z) < bare:

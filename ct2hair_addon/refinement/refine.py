@@ -13,7 +13,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import control_points, crowding, eased, easing_lengths, polylines
+from .curves import control_points, crowding, eased, easing_lengths, mean_curvature, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
@@ -106,7 +106,8 @@ def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> St
     voxel = density.spacing
     even = strands.resampled_by_step(voxel)
     crowded = crowding(strands, density, profile.peak)
-    points = eased(even.points, even.offsets, easing_lengths(strands, voxel, crowded), voxel, crowded)
+    lengths = easing_lengths(mean_curvature(strands, voxel, crowded), voxel, crowded)
+    points = eased(even.points, even.offsets, lengths, voxel, crowded)
     return Strands(points.astype(np.float32), even.offsets)
 
 

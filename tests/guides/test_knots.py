@@ -37,7 +37,7 @@ def tied_hair(ball):
     miss = random.normal(size=(len(knots), 2)) * [0.25, 0.15]
     found = knots - (BEHIND + miss[:, :1]) * along + miss[:, 1:] * across
     forward = 0.87 * along + 0.5 * normal
-    return knots, ball.closest_scalp(found).position.astype(float), forward
+    return knots, ball.closest_scalp(found), forward
 
 
 def test_roots_go_to_their_own_knots(ball, tied_hair):
@@ -55,7 +55,7 @@ def test_roots_without_a_knot_take_what_the_others_missed(ball, tied_hair):
     roots, tied = tie_to_knots(found, forward, ball, knots[seen])
     alone = ~tied
     assert 0.2 < alone.mean() < 0.5
-    before, after = (np.median(np.linalg.norm(some[alone] - knots[alone], axis=1)) for some in (found, roots))
+    before, after = (np.median(np.linalg.norm(some[alone] - knots[alone], axis=1)) for some in (found.position, roots))
     assert after < 0.6 * before
 
 
@@ -63,7 +63,7 @@ def test_roots_without_a_knot_take_what_the_others_missed(ball, tied_hair):
 def test_without_knots_by_the_scalp_nothing_moves(knots, ball, tied_hair):
     _, found, forward = tied_hair
     roots, tied = tie_to_knots(found, forward, ball, knots)
-    np.testing.assert_array_equal(roots, found)
+    np.testing.assert_array_equal(roots, found.position)
     assert not tied.any()
 
 

@@ -32,7 +32,7 @@ def one(points):
 
 def ease(points, lengths=None):
     strands = one(points)
-    lengths = easing_lengths(strands, VOXEL) if lengths is None else np.array([lengths])
+    lengths = easing_lengths(mean_curvature(strands, VOXEL), VOXEL) if lengths is None else np.array([lengths])
     return eased(np.asarray(points, float), strands.offsets, lengths, VOXEL)
 
 
@@ -67,7 +67,7 @@ def test_noise_of_smooth_hair_is_eased_and_its_bend_kept():
 def test_a_curl_is_left_as_it_is():
     s = np.arange(0.0, 150.0, VOXEL)
     curl = np.stack([5 * np.cos(s / 6.0), 5 * np.sin(s / 6.0), 0.5 * s], axis=1)
-    assert easing_lengths(one(curl), VOXEL)[0] == 0.0
+    assert easing_lengths(mean_curvature(one(curl), VOXEL), VOXEL)[0] == 0.0
     np.testing.assert_array_equal(ease(curl), curl)
 
 
@@ -99,8 +99,8 @@ def test_amid_many_strands_hops_are_eased_and_longer_ones_than_else():
     clean = arc(70.0, length=200.0)
     hops = clean + np.cumsum(np.random.default_rng(4).normal(size=(len(clean), 3)), axis=0) * 0.05
     strands, crowded = one(hops), np.array([MOST_CROWDED])
-    alone = eased(hops, strands.offsets, easing_lengths(strands, VOXEL), VOXEL)
-    amid = eased(hops, strands.offsets, easing_lengths(strands, VOXEL, crowded), VOXEL, crowded)
+    alone = eased(hops, strands.offsets, easing_lengths(mean_curvature(strands, VOXEL), VOXEL), VOXEL)
+    amid = eased(hops, strands.offsets, easing_lengths(mean_curvature(strands, VOXEL, crowded), VOXEL, crowded), VOXEL, crowded)
     true = mean_curvature(one(clean), VOXEL)[0]
     assert abs(mean_curvature(strands, VOXEL, crowded)[0] - true) < 0.5 * abs(mean_curvature(strands, VOXEL)[0] - true)
     assert mean_curvature(one(amid), VOXEL)[0] - true < 0.6 * (mean_curvature(one(alone), VOXEL)[0] - true)
