@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -46,19 +47,26 @@ VOXEL_SECONDS, FIT_SECONDS, START_SECONDS = 6.0e-6, 5.5e-6, 25.0
 """Seconds a hair voxel on two threads for all but the fit, and for a fit of 60 steps, and to start: bob, 0.4 mm, 241 s."""
 STORED_SHARE = 5.5
 """Voxels in bricks a hair voxel, on the same scan."""
+STAGE_BYTES = 10.5
+"""Peak memory of the stages for each stored voxel, beside the density: a residual, and the field or a potential."""
+ENGINE_MEMORY = 1.0
+"""GB of the interpreter with numba and torch before any volume."""
+
+
+def needed_memory(stored_voxels: float, voxel_bytes: float) -> float:
+    """GB at the stages' peak, from the voxels in the density's bricks and the bytes of each."""
+    return ENGINE_MEMORY + (voxel_bytes + STAGE_BYTES) * stored_voxels / 1e9
 
 
 def estimated_cost(hair_voxels: float, iterations: int, threads: int) -> tuple[float, float]:
     """(minutes, GB) that a reconstruction takes, from hair voxels and the fit's steps: right within a factor of two."""
     each = (VOXEL_SECONDS + FIT_SECONDS * iterations / 60.0) * 2.0 / max(threads, 1)
-    return (START_SECONDS + hair_voxels * each) / 60.0, 1.0 + 4.0 * 4e-9 * STORED_SHARE * hair_voxels
+    return (START_SECONDS + hair_voxels * each) / 60.0, needed_memory(STORED_SHARE * hair_voxels, 2.0)
 
 
 def machine_memory() -> float:
     """GB (10^9 bytes) of memory in the machine; infinity where the system can't say."""
     try:
-        import os
-
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     except (ValueError, AttributeError, OSError):
         return float("inf")

@@ -25,7 +25,7 @@ from .evaluation import write_report
 from .guides import Guides, StrandProfile, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
-from .measure import Meter, machine_memory
+from .measure import Meter, machine_memory, needed_memory
 from .orientation import OrientationField, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, refine
@@ -49,10 +49,6 @@ _TYPES = (
     BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds, WigScan,
 )  # fmt: skip
 """What checkpoints are made of."""
-DENSITY_COPIES = 4.0
-"""Peak memory of the stages over the density's bricks, as measured on scans of 10^6 to 10^8 hair voxels."""
-ENGINE_MEMORY = 1.0
-"""GB of the interpreter with numba and torch before any volume."""
 
 Value = TypeVar("Value")
 
@@ -356,7 +352,7 @@ class _Job:
     def _check_memory(self, density: BrickVolume) -> None:
         """Refuse before the long stages what would not fit the memory allowed."""
         allowed = self.settings.run.memory or 0.75 * machine_memory()
-        needed = ENGINE_MEMORY + DENSITY_COPIES * density.nbytes / 1e9
+        needed = needed_memory(density.bricks.size, density.bricks.itemsize)
         if needed > allowed:
             raise CT2HairError(
                 f"{self.scan}: the stages need about {needed:.1f} GB of memory, {allowed:.1f} GB are allowed; "

@@ -69,7 +69,7 @@ def compare(density: BrickVolume, level: float, truth: Strands) -> list[dict[str
     """
     low = fullest_cube(density, level) * BRICK
     shape = np.minimum(EDGE * BRICK, np.array(density.shape) - low)
-    dense = np.ascontiguousarray(density.block(low, low + shape))
+    dense = np.ascontiguousarray(density.block(low, low + shape), np.float32)
     cube = BrickVolume.from_dense(dense, density.spacing, density.to_scan(low))
     hair = np.argwhere(dense > level)
     places = cube.to_scan(hair)

@@ -16,8 +16,9 @@ import numba
 import numpy as np
 from scipy.special import ndtri
 
-from ..errors import SettingsError
+from ..errors import ScanError, SettingsError
 from ..head import Head, HeadMesh
+from ..measure import machine_memory
 from ..progress import Progress, part, silent
 from ..settings import SynthesisSettings
 from ..strands import Strands, concatenate
@@ -38,6 +39,9 @@ HAIR_SHARE = 0.35
 
 _SLAB_BYTES = 256e6
 """Values of one slab on its way to the file, roughly."""
+
+GRID_BYTES = 4.6
+"""Memory a voxel of an OpenVDB grid of floats that is full."""
 
 _FIELD_STEP = 1.0
 """Lattice (mm) of the mannequin's signed distance: ears and nose are curved over several millimetres."""
@@ -97,6 +101,8 @@ def synthesize(
     surface = Head(head) if raw and (chosen.net or chosen.mannequin != "none") else None
 
     origin, shape = _box(strands, head if raw and chosen.mannequin != "none" else None, spacing, chosen)
+    if raw and _format(out) == ".vdb":
+        _check_grid(out, shape)
     if _format(out) in WITHOUT_ORIGIN:
         shift = np.eye(4)
         shift[:3, 3] = -origin
@@ -168,6 +174,16 @@ def synthesize(
     beside.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
     beside.replace(files["json"])
     return Synthesis(strands, head, files, description, tally)
+
+
+def _check_grid(out: Path, shape: tuple[int, ...]) -> None:
+    """Refuse a raw scan as a grid that no memory holds: noise fills every voxel, and OpenVDB's writer takes it whole."""
+    needed, allowed = GRID_BYTES * float(np.prod(shape, dtype=np.float64)) / 1e9, 0.75 * machine_memory()
+    if needed > allowed:
+        raise ScanError(
+            f"{out}: a raw scan of {shape[0]} x {shape[1]} x {shape[2]} voxels takes {needed:.1f} GB as a grid, and "
+            f"{allowed:.1f} GB of memory are there for it; write a .nrrd, which goes to the disk slab by slab, or a clean scan"
+        )
 
 
 def _format(out: Path) -> str:

@@ -95,7 +95,7 @@ def fit_to_volume(
         stiffness = np.clip(bends, settings.stiffness * size, SMOOTH_HAIR * settings.stiffness * size)
         gain = profile.line_mass / size**2
         newton = 8.0 * np.pi * level.blur**4 / gain
-        residual, potential = np.empty_like(level.scan.bricks), np.empty_like(level.scan.bricks)
+        residual, potential = (np.empty(level.scan.bricks.shape, np.float32) for _ in range(2))
         forces, weights = np.empty_like(points), np.empty(len(points))
         velocity = np.zeros_like(points)
         rest = points.copy()
@@ -129,5 +129,5 @@ def fit_to_volume(
 def _scale(scan: BrickVolume) -> float:
     """Half the square sum of the scan: what a misfit is a share of."""
     chunks = range(0, len(scan.bricks), 1024)
-    total = sum(float(np.square(scan.bricks[at : at + 1024]).sum(dtype=np.float64)) for at in chunks)
+    total = sum(float(np.square(scan.bricks[at : at + 1024], dtype=np.float32).sum(dtype=np.float64)) for at in chunks)
     return max(0.5 * total, 1e-12)

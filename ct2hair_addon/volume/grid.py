@@ -20,7 +20,8 @@ class BrickVolume:
 
     table: (bx, by, bz) int32; the row of `bricks` that holds brick (I, J, K), or -1 where nothing is stored.
         Brick (I, J, K) covers voxels [16 I, 16 I + 16) and so on.
-    bricks: (B, 16, 16, 16) float32 (or another dtype for masks and labels), indexed [x, y, z] inside a brick.
+    bricks: (B, 16, 16, 16) float32, int16 for the density of most scans (or another dtype for masks and labels), indexed
+        [x, y, z] inside a brick.
     spacing: mm, the same along the three axes. origin: (3,) float64 mm, the centre of voxel (0, 0, 0).
     """
 

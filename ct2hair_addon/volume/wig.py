@@ -57,6 +57,8 @@ BUMP = 0.6
 """On the mannequin's skin a knot is a bump of at least this share of what a knot at the threshold makes."""
 MOST_KNOTS = 1024
 """Knots noted in a block of 48^3 voxels."""
+FINE_UNITS, MOST_STRANDS = 32, 16
+"""A lone strand is at least so many units of what is stored whole, and so many of them fit in."""
 ENOUGH_BUMPS = 500
 """Knots on the mannequin's skin from which on no others are needed."""
 
@@ -65,7 +67,8 @@ ENOUGH_BUMPS = 500
 class WigScan:
     """A wig as later stages need it, in the scan frame.
 
-    density: BrickVolume float32, air at 0, the mannequin cleared to 0. hair_level: density above which a voxel is hair.
+    density: BrickVolume, air at 0, the mannequin cleared to 0; int16 in the scan's own units where they are fine enough for
+    that (CT numbers are), else float32. hair_level: density above which a voxel is hair.
     knots: (K, 3) float32 mm, blobs denser than strands: knots of the net, and some chance crossings of hair.
     solid_points: (S, 3) float32 mm on the mannequin's outer surface; none without a mannequin. tally: what was kept and left
     out. warnings: what was assumed.
@@ -89,7 +92,7 @@ def import_scan(
     size = [scan.shape[axis] for axis in scan.order]
     table = np.full([-(-n // BRICK) for n in size], -1, np.int32)
     core_table = table.copy()
-    bricks: list[np.ndarray] = []
+    bricks = np.empty((0, BRICK, BRICK, BRICK), _storage(thresholds))
     cores: list[np.ndarray] = []
     flats: list[np.ndarray] = []
     wanted: list[np.ndarray] = []
@@ -107,16 +110,13 @@ def import_scan(
         flags = found.flags[tuple(rows.T)]
         wanted.append(flags & 1 > 0)
         hair_voxels += int(found.hair)
-        values = np.empty((len(rows), BRICK, BRICK, BRICK), np.float32)
-        _cut_bricks(slab, rows, before, levels.air, values)
-        bricks.append(values)
+        bricks.resize((stored, BRICK, BRICK, BRICK), refcheck=False)  # grows where it lies: no second copy of a large scan
+        _cut_bricks(slab, rows, before, levels.air, bricks.dtype.kind == "i", bricks[stored - len(rows) :])
         dense = np.flatnonzero(flags & 2)
         core_table[tuple(place[dense].T)] = solid + np.arange(len(dense), dtype=np.int32)
         solid += len(dense)
         cores.append(found.cores[tuple(rows[dense].T)])
         flats.append(found.flats[tuple(rows[dense].T)])
-    values = np.concatenate(bricks) if bricks else np.zeros((0, BRICK, BRICK, BRICK), np.float32)
-    del bricks
     dense, flat = (np.concatenate(parts) if parts else np.zeros((0, BRICK, BRICK), np.uint16) for parts in (cores, flats))
     keep = np.concatenate(wanted) if wanted else np.zeros(0, bool)
     cell = float(scan.spacing[0])
@@ -125,10 +125,10 @@ def import_scan(
     cleared = 0
     if bodies.volume > 0.0:
         surface = bodies.surface(size)
-        index = np.empty((len(values), 3), np.int32)
+        index = np.empty((stored, 3), np.int32)
         where = np.argwhere(table >= 0)
         index[table[tuple(where.T)]] = where
-        cleared = bodies.clear(index, values)
+        cleared = bodies.clear(index, bricks)
         # what is stored for its dense voxels alone stays where that was hair after all
         keep |= (core_table[tuple(index.T)] >= 0) & ~bodies.lie_in(index)
         bumps = [found[bodies.near(found)] for found in bumps]
@@ -138,20 +138,20 @@ def import_scan(
     else:
         keep[:] = True
     knots += bumps
-    table, values = _kept(table, values, keep)
-    density = _in_scan_axes(table, values, scan)
+    table, bricks = _kept(table, bricks, keep)
+    density = _in_scan_axes(table, bricks, scan)
     tally = {
         "voxels of the scan": int(np.prod(scan.shape, dtype=np.int64)),
         "strand-like voxels": hair_voxels,
-        "bricks kept": len(values),
+        "bricks kept": len(bricks),
         "bricks left out: air": int(np.prod(table.shape)) - stored,
-        "bricks left out: mannequin": stored - len(values),
+        "bricks left out: mannequin": stored - len(bricks),
         "voxels cleared: mannequin": cleared,
         "knot points": sum(len(found) for found in knots),
         "mannequin surface points": len(surface),
         "voxels without a number, taken as air": scan.not_numbers,
     }
-    if not len(values):
+    if not len(bricks):
         raise ScanError(
             f"{scan.path}: no hair is left above air ({thresholds.air:.6g}) at the hair level {thresholds.hair:.6g}; "
             "set scan.hair lower"
@@ -399,11 +399,23 @@ def _widen(mask, reach):
                             mask[i, j, at] = True
 
 
+def _storage(thresholds: Thresholds) -> type:
+    """int16 where a strand is many of the scan's units and few of int16's range, as in CT numbers; half of float32's memory."""
+    return np.int16 if FINE_UNITS <= thresholds.strand <= np.iinfo(np.int16).max / MOST_STRANDS else np.float32
+
+
 @numba.njit(cache=True, parallel=True, nogil=True)
-def _cut_bricks(slab, rows, before, air, out):
+def _cut_bricks(slab, rows, before, air, whole, out):
+    """Fill out (B, 16, 16, 16) with the slab's bricks `rows` less air; rounded to int16's range with `whole`."""
     for n in numba.prange(len(rows)):
         start = np.array([rows[n, 0] * BRICK + before, rows[n, 1] * BRICK, rows[n, 2] * BRICK])
-        cut_block(slab, start, 0, air, out[n])
+        block = np.empty((BRICK, BRICK, BRICK), np.float32)
+        cut_block(slab, start, 0, air, block)
+        for i in range(BRICK):
+            for j in range(BRICK):
+                for k in range(BRICK):
+                    value = block[i, j, k]
+                    out[n, i, j, k] = min(max(np.rint(value), -32768.0), 32767.0) if whole else value
 
 
 def _kept(table: np.ndarray, bricks: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from ct2hair_addon.errors import SettingsError
+from ct2hair_addon.errors import ScanError, SettingsError
 from ct2hair_addon.evaluation import render_density, strand_peak, synthesis, synthesize
 from ct2hair_addon.evaluation.hairnet import hairnet, knots
 from ct2hair_addon.head import Head
@@ -96,6 +96,15 @@ def test_bad_settings_are_named(ball, spikes, tmp_path):
     with pytest.raises(SettingsError, match="voxel size"):
         synthesize(spikes, ball, tmp_path / "scan.npy", 0.0)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_grid_that_no_memory_holds_is_refused_before_the_work(ball, spikes, tmp_path, monkeypatch):
+    monkeypatch.setattr(synthesis, "machine_memory", lambda: 0.02)
+    with pytest.raises(ScanError, match=r"scan\.vdb.*GB.*\.nrrd"):
+        synthesize(spikes, ball, tmp_path / "scan.vdb", 0.5)
+    assert not list(tmp_path.iterdir())
+    synthesize(spikes, ball, tmp_path / "scan.vdb", 0.5, clean=True)
+    assert (tmp_path / "scan.vdb").is_file()
 
 
 def test_rings_are_rings(ball, spikes, tmp_path):

@@ -52,7 +52,29 @@ def test_what_is_kept_are_the_scans_values_over_air_in_their_place(result, dense
     np.testing.assert_allclose(result.density.origin, origin)
     assert result.density.spacing == pytest.approx(SPACING)
     kept = found != 0.0
-    np.testing.assert_allclose(found[kept], values[kept] - np.float32(result.thresholds.air), atol=1e-3)
+    assert found.dtype == np.int16
+    np.testing.assert_allclose(found[kept], values[kept] - np.float32(result.thresholds.air), atol=0.5)
+
+
+def test_units_too_coarse_or_too_fine_for_whole_numbers_are_kept_as_they_are(piece, tmp_path):
+    for name, unit in (("fine", 1.0 / 4096.0), ("coarse", 40.0)):
+        np.save(tmp_path / f"{name}.npy", piece.astype(np.float32) * np.float32(unit))
+        levels = {field: getattr(BY_HAND, field) * unit for field in ("air", "noise", "strand", "hair", "knots", "solid")}
+        found = imported(tmp_path / f"{name}.npy", replace(BY_HAND, **levels)).density.bricks
+        assert found.dtype == np.float32
+        np.save(tmp_path / "whole.npy", piece)
+        whole = imported(tmp_path / "whole.npy").density.bricks
+        np.testing.assert_allclose(found / unit, whole, atol=0.01)
+
+
+def test_values_past_the_range_of_whole_numbers_end_at_it(piece, tmp_path):
+    high = piece.astype(np.float32)
+    at = np.unravel_index(np.argmax(np.where(high < 1500, high, 0)), high.shape)  # hair, not mannequin
+    high[at] = 90000.0
+    np.save(tmp_path / "scan.npy", high)
+    found = imported(tmp_path / "scan.npy", NO_BODY).density
+    assert found.bricks.dtype == np.int16
+    assert found.block(at, np.add(at, 1))[0, 0, 0] == np.iinfo(np.int16).max
 
 
 def test_the_hair_is_kept_and_most_of_the_air_is_not(result, scan, dense):
