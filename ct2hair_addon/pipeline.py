@@ -22,7 +22,7 @@ from . import __version__
 from .checkpoints import Checkpoints, chained_key, fingerprint
 from .errors import CT2HairError
 from .evaluation import write_report
-from .guides import Guides, StrandProfile, trace_guides
+from .guides import Guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, machine_memory, needed_memory
@@ -32,6 +32,7 @@ from .refinement import Refined, refine
 from .settings import STOPS, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
+from .volume.strand_signal import StrandProfile
 
 STAGES = ("scan", "head", "orientation", "guides", "dense", "refinement", "result")
 SHARES = dict(zip(STAGES, (0.15, 0.08, 0.08, 0.35, 0.08, 0.22, 0.04), strict=True))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numba
 import numpy as np
 
 from ..volume.grid import BrickVolume, voxel
+from ..volume.strand_signal import TYPICAL_BLUR, StrandProfile
 from .sampling import centred
 
 BINS = 16
@@ -22,24 +21,6 @@ FAINTER = (5.0, 40.0)
 CENTRING = 0.25
 """voxel; how far candidates' centres are off along each axis of the plane: it widens their mean cross-section, the mass
 kept."""
-USUAL_BLUR = 0.85
-"""voxel; the width taken where no lone strand shows (EVALUATION.md: 0.8 to 0.9)."""
-
-
-@dataclass(frozen=True)
-class StrandProfile:
-    """A lone strand's cross-section `peak * exp(-d^2 / (2 blur^2))`: peak in density, blur in voxels.
-
-    seen: the mean that trilinear reads give on its centre line, lower than the peak because they blur by themselves.
-    """
-
-    peak: float
-    blur: float
-
-    @property
-    def seen(self) -> float:
-        # Linear interpolation between voxels blurs by a variance of 1/6 voxel^2 an axis on average.
-        return self.peak * self.blur**2 / (self.blur**2 + 1.0 / 6.0)
 
 
 def strand_profile(density: BrickVolume, hair_level: float, voxels: np.ndarray, directions: np.ndarray) -> StrandProfile:
@@ -49,14 +30,14 @@ def strand_profile(density: BrickVolume, hair_level: float, voxels: np.ndarray, 
     mean cross-section is fitted. Where the hair is too thick for any, the thinnest tenth stands in, with the usual blur.
     """
     if len(voxels) == 0:
-        return StrandProfile(max(2.0 * hair_level, 1e-6), USUAL_BLUR)
+        return StrandProfile.gaussian(max(2.0 * hair_level, 1e-6), TYPICAL_BLUR, density.spacing)
     sums, counts = _cross_sections(density.table, density.bricks, voxels.astype(np.float64), directions.astype(np.float64))
     inner, outer = slice(0, 4), slice(10, BINS)
     centre = sums[:, inner].sum(1) / np.maximum(counts[:, inner].sum(1), 1)
     around = np.abs(sums[:, outer].sum(1)) / np.maximum(counts[:, outer].sum(1), 1)
     good = centre > hair_level
     if good.sum() < 10:
-        return StrandProfile(max(float(centre.max()), hair_level), USUAL_BLUR)
+        return StrandProfile.gaussian(max(float(centre.max()), hair_level), TYPICAL_BLUR, density.spacing)
     emptiness = np.where(good, around / np.maximum(centre, 1e-9), np.inf)
     chosen = np.argsort(emptiness, kind="stable")[: max(int(LONE_SHARE * good.sum()), 10)]
     # Two strands on top of each other look as lone as one, only brighter: the fainter part of what is left.
@@ -71,9 +52,9 @@ def strand_profile(density: BrickVolume, hair_level: float, voxels: np.ndarray, 
             wide = -0.5 / slope
             square = max(wide - CENTRING**2, 0.3)
             if square <= 6.0:
-                return StrandProfile(float(np.exp(level) * wide / square), float(np.sqrt(square)))
+                return StrandProfile.gaussian(np.exp(level) * wide / square, np.sqrt(square), density.spacing, len(chosen))
     thin = np.percentile(centre[good], 10)
-    return StrandProfile(float(thin), USUAL_BLUR)
+    return StrandProfile.gaussian(thin, TYPICAL_BLUR, density.spacing)
 
 
 @numba.njit(cache=True, parallel=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..volume.grid import BRICK, BrickVolume
-from .profile import StrandProfile
+from ..volume.strand_signal import StrandProfile
 from .sampling import centred, density_at, plane
 
 SEED_SHARE = 8

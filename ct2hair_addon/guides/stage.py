@@ -12,11 +12,12 @@ from ..progress import Progress, part, silent
 from ..settings import GuideSettings
 from ..strands import Strands
 from ..volume.grid import BrickVolume
+from ..volume.strand_signal import StrandProfile
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
 from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
-from .profile import StrandProfile, strand_profile
+from .profile import strand_profile
 from .seeds import seed_order, seed_voxels
 from .trace import trace_segments
 

@@ -17,8 +17,7 @@ import numpy as np
 from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..volume.grid import BrickVolume
-from ..volume.strand_signal import add_strand
-from .profile import StrandProfile
+from ..volume.strand_signal import StrandProfile, add_strand
 from .sampling import centred, density_at, line_mean, plane
 
 MOST_STEPS = 3000

@@ -14,7 +14,7 @@ import numpy as np
 from ..progress import Progress, part, silent
 from ..volume import BrickVolume
 from ..volume.grid import trilinear, voxel
-from ..volume.strand_signal import StrandProfile, add_strand
+from ..volume.strand_signal import INTERPOLATION_VARIANCE, StrandProfile, add_strand
 from .splat import CHUNK, blurred, cubic, render, segment_samples
 
 LEAST_EARNED = 8.0
@@ -60,7 +60,7 @@ def prune(
     blur = float(np.hypot(profile.blur, reach))
     peak = gain / (2.0 * np.pi * blur**2)
     # what trilinear reads see of a strand's profile on its line and on the ring
-    wide = blur**2 + 1.0 / 6.0
+    wide = blur**2 + INTERPOLATION_VARIANCE
     seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
     earned = np.empty(len(counts))
     bare = 0.0 if reach else BARE * peak

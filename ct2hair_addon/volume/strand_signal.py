@@ -43,13 +43,23 @@ class StrandProfile:
 
     peak: density on the axis of a lone straight strand, above air. blur: standard deviation of its Gaussian cross-section,
     voxels. line_mass: integral of density over the cross-section, density * mm^2; the mass of 1 mm of hair.
-    pieces: lone pieces that it was measured on; 0 where typical values had to do.
+    pieces: lone pieces that it was measured on; 0 where typical values had to do. seen: the mean that trilinear reads give on
+    its axis, lower than the peak because they blur by themselves.
     """
 
     peak: float
     blur: float
     line_mass: float
     pieces: int
+
+    @classmethod
+    def gaussian(cls, peak: float, blur: float, spacing: float, pieces: int = 0) -> StrandProfile:
+        """The profile of this peak (density) and blur (voxels of `spacing` mm)."""
+        return cls(float(peak), float(blur), float(peak) * 2.0 * np.pi * (float(blur) * spacing) ** 2, pieces)
+
+    @property
+    def seen(self) -> float:
+        return self.peak * self.blur**2 / (self.blur**2 + INTERPOLATION_VARIANCE)
 
 
 def lone_profile(
@@ -83,7 +93,7 @@ def lone_profile(
     axis = axis[axis > hair_level]
     if peak <= 0.0:
         peak = float(np.quantile(axis, 0.2)) if len(axis) else 2.0 * hair_level
-    return StrandProfile(peak, TYPICAL_BLUR, peak * 2.0 * np.pi * (TYPICAL_BLUR * density.spacing) ** 2, 0)
+    return StrandProfile.gaussian(peak, TYPICAL_BLUR, density.spacing)
 
 
 def _typical_lone(images: np.ndarray, straight: np.ndarray, hair_level: float, spacing: float) -> StrandProfile | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from ct2hair_addon.evaluation import strand_peak
@@ -21,4 +20,4 @@ def head(make_ball) -> Head:
 def profile() -> StrandProfile:
     """Of what `render_density` makes at 0.6 mm: two points a voxel under a Gaussian of 0.85 voxel."""
     peak = strand_peak(BLUR)
-    return StrandProfile(peak, BLUR, peak * 2.0 * np.pi * (BLUR * SPACING) ** 2, 1000)
+    return StrandProfile.gaussian(peak, BLUR, SPACING, 1000)

@@ -12,7 +12,7 @@ from ct2hair_addon.volume.strand_signal import StrandProfile
 
 VOXEL = 0.5
 BLUR = 0.85
-PROFILE = StrandProfile(strand_peak(BLUR), BLUR, 2.0 * np.pi * BLUR**2 * strand_peak(BLUR) * VOXEL**2, 9)
+PROFILE = StrandProfile.gaussian(strand_peak(BLUR), BLUR, VOXEL)
 LENGTH = 40.0
 
 
