@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
@@ -32,6 +33,17 @@ class Meter:
             return int(line.split()[1]) * 1024 / 1e9
         except (OSError, StopIteration):
             return _peak_by_rusage()
+
+
+def release_memory() -> None:
+    """Give memory that is free, but held for later by the C library's heap, back to the system (glibc; nothing elsewhere).
+
+    Arrays of a few megabytes that come and go leave holes; after a stage on a large scan those are gigabytes.
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
 
 
 def _peak_by_rusage() -> float:

@@ -25,7 +25,7 @@ from .evaluation import write_report
 from .guides import Guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
-from .measure import Meter, machine_memory, needed_memory
+from .measure import Meter, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, refine
@@ -326,6 +326,7 @@ class _Job:
             progress(0.0, 1.0)
             result = work(progress)
             self.checkpoints.save(name, self.keys[name], result)
+            release_memory()
         self.costs.append({"name": name, "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": resumed})
         progress(1.0, 1.0)
         return result

@@ -366,9 +366,9 @@ def _cheaper(best, more):
     known = pair[place] == more[0]
     won = np.flatnonzero(known)[more[2][known] < cost[place[known]]]
     cut[place[won]], cost[place[won]] = more[1][won], more[2][won]
-    pair = np.concatenate([pair, more[0][~known]])
-    order = np.argsort(pair, kind="stable")
-    return pair[order], np.concatenate([cut, more[1][~known]])[order], np.concatenate([cost, more[2][~known]])[order]
+    new = np.flatnonzero(~known)
+    place = np.searchsorted(pair, more[0][new])
+    return tuple(np.insert(old, place, some[new], axis=0) for old, some in zip(best, more, strict=True))
 
 
 def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: float):
@@ -427,7 +427,10 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
         jump = 0.0
         for axis in range(3):
             jump += (bend[a, axis] - root_bend[b, axis]) ** 2
-        best += jump / (BEND[0] + BEND[1] * gap) ** 2
+        best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
+        if best >= LOOSE_END:
+            cost[n] = best
+            continue
         backed = 0.0
         many = int(gap) + 1
         for m in range(many):
@@ -438,7 +441,7 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
             y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
             z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
             backed += min(max(trilinear(table, bricks, np.float32(0.0), x, y, z) / strand, 0.0), 1.0)
-        cost[n] = best + PER_VOXEL * gap + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
+        cost[n] = best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 
 def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
