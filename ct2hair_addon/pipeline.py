@@ -225,14 +225,17 @@ class _Job:
         """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
-            field = self._stage(
-                "orientation",
-                lambda progress: orientation_field(density, level, self.settings.orientation, progress=progress),
-            )
+            # in a list, to be handed over and held no longer: it is of the guides' peak of memory
+            fields = [
+                self._stage(
+                    "orientation",
+                    lambda progress: orientation_field(density, level, self.settings.orientation, progress=progress),
+                )
+            ]
         guides = self._stage(
             "guides",
             lambda progress: trace_guides(
-                density, level, field, head, self.settings.guides, self.settings.run.seed, progress, knots
+                density, level, fields.pop(), head, self.settings.guides, self.settings.run.seed, progress, knots
             ),
             guides,
         )

@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
 from ..strands import Strands, offsets_from_counts
-from ..volume.grid import BrickVolume, trilinear
+from ..volume.grid import BrickVolume
+from .sampling import density_at
 
 CUTS = (0.0, 4.0, 8.0, 12.0)
 """voxel; a trace may have gone too far, onto a neighbour: a joint may leave it this far before its end, and enter another
@@ -440,7 +441,7 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
             x = wa * place[a, 0] + va * out[a, 0] + wb * root_place[b, 0] - vb * root_out[b, 0] - origin[0]
             y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
             z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
-            backed += min(max(trilinear(table, bricks, np.float32(0.0), x, y, z) / strand, 0.0), 1.0)
+            backed += min(max(density_at(table, bricks, x, y, z) / strand, 0.0), 1.0)
         cost[n] = best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -20,6 +22,14 @@ CHUNK = 65536
 """Seeds weighed in one call: a fraction of a second."""
 REACH = 5
 """voxel; half the line over which a seed's density is averaged: noise of SNR 2 falls below a sixth of a strand."""
+
+
+class Seeds(NamedTuple):
+    """Voxels that strands are picked up at. voxels: (S, 3) int32; directions: (S, 3) int8, unit * 127; shuffle: (S,) uint32 keys."""
+
+    voxels: np.ndarray
+    directions: np.ndarray
+    shuffle: np.ndarray
 
 
 @numba.njit(cache=True, nogil=True)
@@ -64,8 +74,8 @@ def _collect(confidence, direction, corner, rows, starts, seed, voxels, directio
                 at += 1
 
 
-def seed_voxels(confidence: BrickVolume, direction: BrickVolume, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(M, 3) int32 voxels, (M, 3) int8 directions, (M,) uint32 shuffle keys: a fixed random choice of the field's voxels."""
+def seed_voxels(confidence: BrickVolume, direction: BrickVolume, seed: int) -> Seeds:
+    """A fixed random choice of the orientation field's voxels."""
     rows = np.arange(len(confidence.bricks), dtype=np.int64)
     counts = _count(confidence.bricks, rows, seed)
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -74,7 +84,7 @@ def seed_voxels(confidence: BrickVolume, direction: BrickVolume, seed: int) -> t
     shuffle = np.empty(starts[-1], np.uint32)
     corner = confidence.brick_index * BRICK
     _collect(confidence.bricks, direction.bricks, corner, rows, starts[:-1], seed, voxels, directions, shuffle)
-    return voxels, directions, shuffle
+    return Seeds(voxels, directions, shuffle)
 
 
 def seed_order(

@@ -18,7 +18,7 @@ from .growing import grow_to_root, lead_into_scalp, push_out
 from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
 from .profile import strand_profile
-from .seeds import seed_order, seed_voxels
+from .seeds import Seeds, seed_order, seed_voxels
 from .trace import trace_segments
 
 PROFILED = 8000
@@ -51,26 +51,24 @@ class Guides:
 def find_segments(
     density: BrickVolume,
     hair_level: float,
-    field: HairField,
+    seeds: Seeds,
     settings: GuideSettings,
-    seed: int,
     progress: Progress = silent,
 ) -> tuple[Strands, StrandProfile, dict[str, int]]:
     """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing."""
-    voxels, directions, shuffle = seed_voxels(field.confidence, field.direction, seed)
-    profile = _profile(density, hair_level, voxels, directions, shuffle)
-    order = seed_order(density, voxels, directions, shuffle, profile, part(progress, 0.0, 0.15))
+    profile = _profile(density, hair_level, seeds)
+    order = seed_order(density, *seeds, profile, part(progress, 0.0, 0.15))
     residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
-    found = trace_segments(residual, voxels, directions, order, profile, settings, part(progress, 0.15, 1.0))
+    found = trace_segments(residual, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.15, 1.0))
     return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
 
 
-def _profile(density: BrickVolume, hair_level: float, voxels, directions, shuffle) -> StrandProfile:
+def _profile(density: BrickVolume, hair_level: float, seeds: Seeds) -> StrandProfile:
     """A lone strand's profile, measured on the first PROFILED of the shuffled seeds."""
-    chosen = np.argsort(shuffle, kind="stable")[:PROFILED]
-    axes = directions[chosen].astype(np.float64)
+    chosen = np.argsort(seeds.shuffle, kind="stable")[:PROFILED]
+    axes = seeds.directions[chosen].astype(np.float64)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return strand_profile(density, hair_level, voxels[chosen], axes)
+    return strand_profile(density, hair_level, seeds.voxels[chosen], axes)
 
 
 def trace_guides(
@@ -91,11 +89,13 @@ def trace_guides(
     paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
+    seeds = seed_voxels(field.confidence, field.direction, seed)
     if settings.method == "paper":
         strands, tally = paper_guides(density, field.direction, field.confidence, head, settings, seed, progress)
-        seeds = seed_voxels(field.confidence, field.direction, seed)
-        return Guides(strands, _profile(density, hair_level, *seeds), tally)
-    segments, profile, tally = find_segments(density, hair_level, field, settings, seed, part(progress, 0.0, 0.85))
+        return Guides(strands, _profile(density, hair_level, seeds), tally)
+    del field  # as large as the density in float32: its memory is free from here on if the caller, too, has let go of it
+    segments, profile, tally = find_segments(density, hair_level, seeds, settings, part(progress, 0.0, 0.85))
+    del seeds
     strands, more = root_segments(
         segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen, knots=knots
     )

@@ -1,5 +1,6 @@
 """Tracing and subtracting on phantoms: a lone strand, a bundle, a crossing, a helix, noise, threads."""
 
+import weakref
 from itertools import pairwise
 
 import numba
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.errors import Cancelled
-from ct2hair_addon.guides import find_segments
+from ct2hair_addon.guides import find_segments, stage, trace_guides
 from ct2hair_addon.guides.sampling import centred, density_at
+from ct2hair_addon.guides.seeds import seed_voxels
 from ct2hair_addon.guides.trace import add_strand, smoothed
 from ct2hair_addon.orientation import orientation_field
 from ct2hair_addon.settings import GuideSettings, OrientationSettings
@@ -36,9 +38,13 @@ def straight(start, end):
     return start + np.linspace(0, 1, count)[:, None] * (end - start)
 
 
+def seeds_of(field):
+    return seed_voxels(field.confidence, field.direction, 0)
+
+
 def traced(volume, **changes):
     field = orientation_field(volume, 0.35 * PEAK, OrientationSettings())
-    segments, profile, tally = find_segments(volume, 0.35 * PEAK, field, GuideSettings(**changes), 0)
+    segments, profile, tally = find_segments(volume, 0.35 * PEAK, seeds_of(field), GuideSettings(**changes))
     return [volume.to_voxel(line) for line in segments.polylines()], profile, tally
 
 
@@ -114,7 +120,7 @@ def test_cancelling_passes_through():
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        find_segments(volume, 0.35 * PEAK, field, GuideSettings(), 0, stop)
+        find_segments(volume, 0.35 * PEAK, seeds_of(field), GuideSettings(), stop)
 
 
 def test_density_is_trilinear_across_bricks():
@@ -147,3 +153,17 @@ def test_smoothing_keeps_quadratics_and_tames_noise():
     np.testing.assert_allclose(smoothed(parabola, widths, 0.3), parabola, atol=1e-3)
     noisy = parabola + np.random.default_rng(0).normal(0, 0.15, parabola.shape).astype(np.float32)
     assert np.std(smoothed(noisy, widths, 0.5) - parabola) < 0.6 * np.std(noisy - parabola)
+
+
+def test_the_orientation_field_is_let_go_of_before_tracing(monkeypatch):
+    volume = scan([straight((10, 20, 20), (60, 20, 20))], (80, 40, 40))
+    fields = [orientation_field(volume, 0.35 * PEAK, OrientationSettings())]
+    alive = weakref.ref(fields[0])
+
+    def find(*arguments):
+        assert alive() is None
+        raise Cancelled
+
+    monkeypatch.setattr(stage, "find_segments", find)
+    with pytest.raises(Cancelled):
+        trace_guides(volume, 0.35 * PEAK, fields.pop(), None)
