@@ -25,7 +25,10 @@ REACH = 5
 
 
 class Seeds(NamedTuple):
-    """Voxels that strands are picked up at. voxels: (S, 3) int32; directions: (S, 3) int8, unit * 127; shuffle: (S,) uint32 keys."""
+    """Voxels that strands are picked up at.
+
+    voxels: (S, 3) int32. directions: (S, 3) int8, unit * 127. shuffle: (S,) uint32, keys of a fixed random order.
+    """
 
     voxels: np.ndarray
     directions: np.ndarray
