@@ -1,5 +1,7 @@
 """Settings: every field documented, checked, and back from JSON."""
 
+import math
+
 import pytest
 
 from ct2hair_addon.errors import SettingsError
@@ -58,3 +60,9 @@ def test_the_manual_lists_the_parameters_as_they_are():
     script = Path(__file__).resolve().parents[1] / "docs" / "settings_table.py"
     page = runpy.run_path(str(script))
     assert page["PAGE"].read_text(encoding="utf-8") == page["table"](), "run `make manual`"
+
+
+def test_the_paper_preset_gathers_gradients_three_voxels_to_each_side():
+    paper = Settings.preset("paper").orientation
+    assert paper.sigma == 0.0 and math.ceil(2.0 * paper.rho) == 3
+    assert Settings().orientation.sigma > 0.0

@@ -190,10 +190,11 @@ def ablation(bench: Bench, options: Options) -> Page:
         paper, ours = (_threaded(known[name], options) for name in ("paper", "ours"))
         # no refinement is wanted where only what comes before it is looked at
         bare = {"refinement.iterations": 0, "refinement.prune": False}
+        own = {f"orientation.{name}": value for name, value in dataclasses.asdict(ours.orientation).items()}
         variants = {
             "raw gradients (paper)": paper.changed(bare),
             "Gabor filters": paper.changed({**bare, "orientation.method": "gabor"}),
-            "smoothed gradients (ours)": paper.changed({**bare, "orientation.sigma": 0.7, "orientation.reweighting": 0}),
+            "smoothed gradients (ours)": paper.changed(bare | own),
         }
         for label, settings in variants.items():
             result = bench.run(case, f"orientation, {label}", settings)
