@@ -59,7 +59,7 @@ VOXEL_SECONDS, FIT_SECONDS, START_SECONDS = 6.0e-6, 5.5e-6, 25.0
 """Seconds a hair voxel on two threads for all but the fit, and for a fit of 60 steps, and to start: bob, 0.4 mm, 241 s."""
 STORED_SHARE = 5.5
 """Voxels in bricks a hair voxel, on the same scan."""
-STAGE_BYTES = 10.5
+STAGE_BYTES = 9.0
 """Peak memory of the stages for each stored voxel, beside the density: a residual, and the field or a potential."""
 ENGINE_MEMORY = 1.0
 """GB of the interpreter with numba and torch before any volume."""
