@@ -60,7 +60,7 @@ VOXEL_SECONDS, FIT_SECONDS, START_SECONDS = 6.0e-6, 5.5e-6, 25.0
 STORED_SHARE = 5.5
 """Voxels in bricks a hair voxel, on the same scan."""
 STAGE_BYTES = 9.0
-"""Peak memory of the stages for each stored voxel, beside the density: a residual, and the field or a potential."""
+"""Peak memory of the stages for each stored voxel, beside the density: a residual and its potential."""
 ENGINE_MEMORY = 1.0
 """GB of the interpreter with numba and torch before any volume."""
 
@@ -74,6 +74,11 @@ def estimated_cost(hair_voxels: float, iterations: int, threads: int) -> tuple[f
     """(minutes, GB) that a reconstruction takes, from hair voxels and the fit's steps: right within a factor of two."""
     each = (VOXEL_SECONDS + FIT_SECONDS * iterations / 60.0) * 2.0 / max(threads, 1)
     return (START_SECONDS + hair_voxels * each) / 60.0, needed_memory(STORED_SHARE * hair_voxels, 2.0)
+
+
+def allowed_memory(chosen: float = 0.0) -> float:
+    """GB that work may take: what was chosen, or (0) three quarters of the machine's."""
+    return chosen or 0.75 * machine_memory()
 
 
 def machine_memory() -> float:

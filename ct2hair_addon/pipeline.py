@@ -25,7 +25,7 @@ from .evaluation import write_report
 from .guides import Guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
-from .measure import Meter, machine_memory, needed_memory, release_memory
+from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, refine
@@ -356,7 +356,7 @@ class _Job:
 
     def _check_memory(self, density: BrickVolume) -> None:
         """Refuse before the long stages what would not fit the memory allowed."""
-        allowed = self.settings.run.memory or 0.75 * machine_memory()
+        allowed = allowed_memory(self.settings.run.memory)
         needed = needed_memory(density.bricks.size, density.bricks.itemsize)
         if needed > allowed:
             raise CT2HairError(

@@ -69,7 +69,7 @@ class OrientationSettings:
         choices=("gradient", "gabor"),
     )
     sigma: float = parameter(0.7, "Gaussian under the density gradient", unit="voxel", low=0.0, high=3.0)
-    rho: float = parameter(2.0, "Gaussian over which gradients are gathered", unit="voxel", low=0.5, high=5.0)
+    rho: float = parameter(1.75, "Gaussian over which gradients are gathered", unit="voxel", low=0.5, high=5.0)
     reweighting: int = parameter(0, "steps of iterative reweighting against outliers", low=0, high=10)
     confidence: float = parameter(0.1, "voxels of a lower confidence are left out", low=0.0, high=1.0)
 

@@ -18,11 +18,12 @@ from scipy.special import ndtri
 
 from ..errors import ScanError, SettingsError
 from ..head import Head, HeadMesh
-from ..measure import machine_memory
+from ..measure import allowed_memory
 from ..progress import Progress, part, silent
 from ..settings import SynthesisSettings
 from ..strands import Strands, concatenate
 from ..volume import BRICK, ScanWriter
+from ..volume.writers import scan_format
 from .curves import curve_arcs
 from .density import frame_around, render_layers, strand_peak
 from .distance_field import DistanceField, lattice_value
@@ -101,9 +102,9 @@ def synthesize(
     surface = Head(head) if raw and (chosen.net or chosen.mannequin != "none") else None
 
     origin, shape = _box(strands, head if raw and chosen.mannequin != "none" else None, spacing, chosen)
-    if raw and _format(out) == ".vdb":
+    if raw and scan_format(out) == ".vdb":
         _check_grid(out, shape)
-    if _format(out) in WITHOUT_ORIGIN:
+    if scan_format(out) in WITHOUT_ORIGIN:
         shift = np.eye(4)
         shift[:3, 3] = -origin
         strands, head, origin = strands.transformed(shift), head.transformed(shift), np.zeros(3)
@@ -144,7 +145,7 @@ def synthesize(
             share(1, 1)
     tally["hair voxels"] = hair
 
-    stem = out.name[: -len(_format(out))]
+    stem = out.name[: -len(scan_format(out))]
     files = {
         "scan": out,
         "strands": out.with_name(f"{stem}.strands.npz"),
@@ -178,17 +179,12 @@ def synthesize(
 
 def _check_grid(out: Path, shape: tuple[int, ...]) -> None:
     """Refuse a raw scan as a grid that no memory holds: noise fills every voxel, and OpenVDB's writer takes it whole."""
-    needed, allowed = GRID_BYTES * float(np.prod(shape, dtype=np.float64)) / 1e9, 0.75 * machine_memory()
+    needed, allowed = GRID_BYTES * float(np.prod(shape, dtype=np.float64)) / 1e9, allowed_memory()
     if needed > allowed:
         raise ScanError(
             f"{out}: a raw scan of {shape[0]} x {shape[1]} x {shape[2]} voxels takes {needed:.1f} GB as a grid, and "
             f"{allowed:.1f} GB of memory are there for it; write a .nrrd, which goes to the disk slab by slab, or a clean scan"
         )
-
-
-def _format(out: Path) -> str:
-    name = out.name.lower()
-    return ".nii.gz" if name.endswith(".nii.gz") else Path(name).suffix
 
 
 def _mannequin_value(settings: SynthesisSettings) -> float:

@@ -428,10 +428,7 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
         jump = 0.0
         for axis in range(3):
             jump += (bend[a, axis] - root_bend[b, axis]) ** 2
-        best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
-        if best >= LOOSE_END:
-            cost[n] = best
-            continue
+        best += jump / (BEND[0] + BEND[1] * gap) ** 2
         backed = 0.0
         many = int(gap) + 1
         for m in range(many):
@@ -442,7 +439,7 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
             y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
             z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
             backed += min(max(density_at(table, bricks, x, y, z) / strand, 0.0), 1.0)
-        cost[n] = best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
+        cost[n] = best + PER_VOXEL * gap + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 
 def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:

@@ -66,13 +66,10 @@ def orientation_field(
 ) -> OrientationField:
     """Directions of the hair at voxels whose (equally smoothed) density exceeds `hair_level`.
 
-    density: float32, air at 0. The gradient (eq. 1) is taken under a Gaussian of `settings.sigma` voxels and gathered over
-    one of
+    density: air at 0. The gradient (eq. 1) is taken under a Gaussian of `settings.sigma` voxels and gathered over one of
     `settings.rho`; with sigma 0 it is the paper's own, raw central differences within a box of 2 rho voxels to each side,
-    three by default.
-    The direction is the smallest eigenvector of the sum of their outer products (eq. 2), reweighted `settings.reweighting`
-    times.
-    With `settings.method` "gabor" oriented filters on the raw density take their place (`gabor`).
+    three in its preset. The direction is the smallest eigenvector of the sum of their outer products (eq. 2), reweighted
+    `settings.reweighting` times. With `settings.method` "gabor" oriented filters on the raw density take their place (`gabor`).
     The same bits on any number of threads, whatever the blocks.
     """
     settings = settings or OrientationSettings()

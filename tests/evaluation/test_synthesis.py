@@ -99,7 +99,7 @@ def test_bad_settings_are_named(ball, spikes, tmp_path):
 
 
 def test_a_grid_that_no_memory_holds_is_refused_before_the_work(ball, spikes, tmp_path, monkeypatch):
-    monkeypatch.setattr(synthesis, "machine_memory", lambda: 0.02)
+    monkeypatch.setattr(synthesis, "allowed_memory", lambda: 0.015)
     with pytest.raises(ScanError, match=r"scan\.vdb.*GB.*\.nrrd"):
         synthesize(spikes, ball, tmp_path / "scan.vdb", 0.5)
     assert not list(tmp_path.iterdir())

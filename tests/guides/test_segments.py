@@ -77,9 +77,9 @@ def test_neighbours_that_touch_are_both_found():
 def test_a_crossing_is_gone_through_straight():
     curves = [straight((8, 32, 32), (56, 32, 32)), straight((14, 14, 32), (50, 50, 32))]
     lines, _, _ = traced(scan(curves, (64, 64, 64)))
+    assert len(lines) == 2
     for curve in curves:
-        assert max(np.mean(distances(curve, line) < 0.8) for line in lines if distances(line, curve).max() < 0.8) > 0.9
-    assert sum(len(line) for line in lines) < 1.2 * sum(len(curve) for curve in curves)
+        assert min(distances(line, curve).max() for line in lines) < 0.8
 
 
 def test_a_helix_is_followed():

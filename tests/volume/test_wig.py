@@ -53,7 +53,7 @@ def test_what_is_kept_are_the_scans_values_over_air_in_their_place(result, dense
     assert result.density.spacing == pytest.approx(SPACING)
     kept = found != 0.0
     assert found.dtype == np.int16
-    np.testing.assert_allclose(found[kept], values[kept] - np.float32(result.thresholds.air), atol=0.5)
+    np.testing.assert_array_equal(found[kept], np.rint(values[kept] - np.float32(result.thresholds.air)))
 
 
 def test_units_too_coarse_or_too_fine_for_whole_numbers_are_kept_as_they_are(piece, tmp_path):
