@@ -169,7 +169,7 @@ class _Job:
         def fill(progress: Progress) -> Dense:
             count = settings.interpolation.strands
             if not count and settings.interpolation.method == "scalp":
-                # a surplus of guides is left to the refinement, which sees strand by strand what the scan holds
+                # every guide was traced in the scan: the estimate says how many more there are
                 count = max(estimate_strand_count(density, level, guides.strands, head), len(guides.strands))
             return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
 

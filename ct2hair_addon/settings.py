@@ -166,7 +166,7 @@ class RefinementSettings:
     iterations: int = parameter(40, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
     points: int = parameter(128, "control points of each strand at most", low=8, high=256)
     prune: bool = parameter(
-        True, "volume: strands and tips that explain nothing of the scan go, so that the scan tells how many there are"
+        True, "volume: made-up strands and tips that explain nothing of the scan go, and traced strands that only double others"
     )
     coarsest: float = parameter(
         1.0,

@@ -3,7 +3,8 @@
 Removing a stretch of a strand changes half the squared misfit by the integral of `1/2 - a` along it, in units of a lone
 strand's energy, where `a` is how much of a strand is rendered there too many (the misfit's amplitude under a strand's
 profile): 0 where the strand is needed, 1 where it doubles another. What is best kept is the prefix from the root that
-earns most.
+earns most. A strand that was traced has its evidence in the scan, and one that lies a voxel beside its hair looks half a
+double: such a strand stays whole unless it doubles others all along.
 """
 
 from __future__ import annotations
@@ -19,12 +20,16 @@ from .splat import CHUNK, blurred, cubic, render, segment_samples
 
 LEAST_EARNED = 8.0
 """voxel; a strand that earns less than so much of a lone strand's length is left out."""
+DOUBLE = 0.8
+"""A traced strand goes where so much of a strand is too many in the mean along it."""
 LEAST_CUT = 6.0
 """voxel; a tip is cut only where that earns as much."""
 BARE = 0.4
 """The scan shows no hair where it stays below this share of a lone strand's peak."""
 BARE_COST = 1.0
 """What a stretch where the scan shows no hair costs beside its misfit: amid dense hair any strand earns something."""
+REMOVED = "strands removed: the scan has them already"
+CUT_BACK = "tips cut back"
 RING = 1.0
 """voxel; the misfit is read on the centre line and on four points this far from it."""
 
@@ -37,18 +42,20 @@ def prune(
     profile: StrandProfile,
     progress: Progress = silent,
     reach: float = 0.0,
+    traced: np.ndarray | None = None,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """(N,) int64: how many control points of each strand stay, 0 for none; and the counts of what went.
 
     points (M, 3) mm, root first, offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. Strands are judged one after
     another, those that earn least first, each against what the others before it have left; the same on any number of threads.
     reach: voxels by which strands may still be off: scan and rendering are blurred by as much before they are held together,
-    so that one beside hair that nothing else explains is kept.
+    so that one beside hair that nothing else explains is kept. traced: (N,) bool, strands that were found in the scan
+    (None: none was); the others are made up.
     """
     counts = np.diff(offsets)
     kept = counts.copy()
     if not len(counts):
-        return kept, {"strands removed: the scan has them already": 0, "tips cut back": 0}
+        return kept, {REMOVED: 0, CUT_BACK: 0}
     voxels = density.to_voxel(points)
     gain = profile.line_mass / density.spacing**2
     excess = render(voxels, offsets, visible, density, profile.blur, part(progress, 0.0, 0.7))
@@ -67,18 +74,19 @@ def prune(
     _earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, peak, seen, earned)
     progress(0.8, 1.0)
     order = np.argsort(earned, kind="stable")
+    traced = np.zeros(len(counts), bool) if traced is None else np.asarray(traced, bool)
     step = 2000
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
         _cut(
             density.table, excess, density.bricks, bare, voxels, offsets, visible, order[start : start + step], peak, seen,
-            blur, kept,
+            blur, traced, kept,
         )  # fmt: skip
     progress(1.0, 1.0)
     gone = int(np.count_nonzero((kept == 0) & (counts > 0)))
     tally = {
-        "strands removed: the scan has them already": gone,
-        "tips cut back": int(np.count_nonzero((kept > 0) & (kept < counts))),
+        REMOVED: gone,
+        CUT_BACK: int(np.count_nonzero((kept > 0) & (kept < counts))),
     }
     return kept, tally
 
@@ -106,8 +114,8 @@ def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
 
 @numba.njit(cache=True, nogil=True)
 def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned):
-    """Fill `earned` (end - start,) with what the strand earns up to each of its control points."""
-    total = 0.0
+    """Fill `earned` (end - start,) with what the strand earns up to each of its control points; its visible length, voxels."""
+    total, whole = 0.0, 0.0
     earned[0] = 0.0
     for m in range(start, end - 1):
         first, last = m == start, m + 2 >= end
@@ -124,6 +132,7 @@ def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, 
             length = np.sqrt(tx * tx + ty * ty + tz * tz)
             t = (s + 0.5) / count
             shown = (1.0 - t) * visible[m] + t * visible[m + 1]
+            whole += shown * length
             if length > 0.0 and shown > 0.0:
                 x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
                 i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
@@ -135,6 +144,7 @@ def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, 
                     total -= shown * length * BARE_COST
             px, py, pz = qx, qy, qz
         earned[m + 1 - start] = total
+    return whole
 
 
 @numba.njit(cache=True, parallel=True)
@@ -149,19 +159,23 @@ def _earn(table, excess, scan, bare, points, offsets, visible, peak, seen, out):
 
 
 @numba.njit(cache=True, nogil=True)
-def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen, blur, kept):
+def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen, blur, traced, kept):
     for n in order:
         start, end = offsets[n], offsets[n + 1]
         size = end - start
         if size < 2:
             continue
         earned = np.empty(size)
-        _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned)
+        shown = _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned)
         best = 0
         for m in range(size):
             if earned[m] > earned[best]:
                 best = m
-        if earned[best] < LEAST_EARNED:
+        if traced[n]:
+            if earned[size - 1] >= (0.5 - DOUBLE) * shown:
+                continue
+            stay = 0
+        elif earned[best] < LEAST_EARNED:
             stay = 0
         elif earned[best] - earned[size - 1] >= LEAST_CUT and best + 1 < size:
             stay = max(best + 1, 2)

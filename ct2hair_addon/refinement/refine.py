@@ -112,8 +112,12 @@ def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> St
 
 
 def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):
-    """Control points, offsets and strands without what explains nothing of the scan; and the counts of what went."""
-    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress, reach)
+    """Control points, offsets and strands without what explains nothing of the scan; and the counts of what went.
+
+    Strands with the attribute `guide` were traced in the scan; without it, all are taken for made up.
+    """
+    traced = strands.strand_attributes.get("guide")
+    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress, reach, traced)
     first = np.repeat(offsets[:-1], np.diff(offsets))
     points = points[np.arange(len(points)) - first < np.repeat(stay, np.diff(offsets))]
     alive = stay > 0

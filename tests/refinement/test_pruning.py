@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.evaluation import render_density, strand_peak
-from ct2hair_addon.refinement.pruning import prune
+from ct2hair_addon.refinement.pruning import CUT_BACK, REMOVED, prune
 from ct2hair_addon.strands import Strands, concatenate
 from ct2hair_addon.volume.strand_signal import StrandProfile
 
@@ -22,14 +22,20 @@ def line(x: float, low: float = 0.0, high: float = LENGTH) -> Strands:
     return Strands.from_array(points[None].astype(np.float32))
 
 
-def pruned(hair: Strands, strands: Strands, reach: float = 0.0) -> np.ndarray:
+def pruned(hair: Strands, strands: Strands, reach: float = 0.0, traced: list[bool] | None = None) -> np.ndarray:
     """How many of its points each of `strands` keeps over a scan that shows `hair`."""
     scan = render_density(concatenate([hair, line(-20.0, -10.0, 50.0)]), VOXEL, BLUR)
     kept, tally = prune(
-        strands.points.astype(np.float64), strands.offsets, np.ones(len(strands.points)), scan, PROFILE, reach=reach
+        strands.points.astype(np.float64),
+        strands.offsets,
+        np.ones(len(strands.points)),
+        scan,
+        PROFILE,
+        reach=reach,
+        traced=None if traced is None else np.array(traced),
     )
-    assert tally["strands removed: the scan has them already"] == np.count_nonzero(kept == 0)
-    assert tally["tips cut back"] == np.count_nonzero((kept > 0) & (kept < strands.counts))
+    assert tally[REMOVED] == np.count_nonzero(kept == 0)
+    assert tally[CUT_BACK] == np.count_nonzero((kept > 0) & (kept < strands.counts))
     return kept
 
 
@@ -40,6 +46,20 @@ def test_what_the_scan_shows_stays_whole():
 
 def test_of_two_where_the_scan_shows_one_one_stays():
     assert sorted(pruned(line(0.0), concatenate([line(0.0), line(0.1)])).tolist()) == [0, 41]
+
+
+def test_a_traced_strand_goes_only_where_it_doubles_others_all_along():
+    hair = line(0.0)
+    assert sorted(pruned(hair, concatenate([hair, line(0.1)]), traced=[True, True]).tolist()) == [0, 41]
+    short, beside = line(4.0, 0.0, 10.0), line(4.4, 0.0, 10.0)  # 0.8 voxels off its hair: it earns too little if made up
+    assert pruned(short, beside).tolist() == [0]
+    assert pruned(short, beside, traced=[True]).tolist() == [41]
+    aside = np.linspace(-15.0, 15.0, 41).clip(0.0)
+    parting = Strands.from_array(line(0.0).points[None] + aside[:, None] * np.array([1.0, 0.0, 0.0], np.float32))
+    both = concatenate([hair, parting])  # one strand in the first half, two in the second
+    scan = concatenate([hair, Strands.from_array(parting.points[None, 20:])])
+    assert 0 in pruned(scan, both)
+    assert pruned(scan, both, traced=[True, True]).tolist() == [41, 41]
 
 
 def test_two_where_the_scan_shows_two_stay():
