@@ -3,5 +3,6 @@
 import sys
 
 from .cli import main
+from .groom import add_groom
 
-sys.exit(main(sys.argv[1:]))
+sys.exit(main(sys.argv[1:], [add_groom]))

@@ -1,6 +1,7 @@
 """The command line.
 
-synthesize | inspect | reconstruct | batch | evaluate | benchmark | convert | train-prior | study-blending.
+synthesize | inspect | reconstruct | batch | evaluate | benchmark | convert | train-prior | study-blending, and those that
+`main` is given, such as `groom`.
 
 Options of `reconstruct` are made from `settings.py`.
 
@@ -38,9 +39,12 @@ SHORT_NAMES = {
 _TYPES = {"float": float, "int": int, "str": str}
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run one command; returns the exit code. Errors go to standard error as one readable line."""
-    parser = _parser()
+def main(arguments: Sequence[str], more: Sequence[Callable[..., None]] = ()) -> int:
+    """Run one command; returns the exit code. Errors go to standard error as one readable line.
+
+    more: functions that add the commands of whoever stands above this module, by `add_command`.
+    """
+    parser = _parser(more)
     chosen = parser.parse_args(_with_axes(arguments))
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -72,26 +76,27 @@ def _interrupt(*_) -> None:
     raise KeyboardInterrupt
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(more: Sequence[Callable[..., None]]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ct2hair", description="Hair strands from a CT scan of a wig.")
     parser.add_argument("--version", action="version", version=f"ct2hair {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (
         _add_synthesize, _add_inspect, _add_reconstruct, _add_batch, _add_evaluate, _add_benchmark, _add_convert,
-        _add_train_prior, _add_study_blending,
+        *more, _add_train_prior, _add_study_blending,
     ):  # fmt: skip
         add(commands)
     return parser
 
 
-def _add_command(commands, name: str, run, help: str) -> argparse.ArgumentParser:
+def add_command(commands, name: str, run: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
+    """A command of the command line: run(options) returns its exit code."""
     parser = commands.add_parser(name, help=help, description=help, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.set_defaults(run=run)
     return parser
 
 
 def _add_reconstruct(commands) -> None:
-    parser = _add_command(commands, "reconstruct", _reconstruct, "reconstruct the hair of a scan into a folder")
+    parser = add_command(commands, "reconstruct", _reconstruct, "reconstruct the hair of a scan into a folder")
     parser.add_argument("scan", type=Path, help="the CT volume: .vdb .npy .raw .tif .nii .nrrd .mha, or a folder of slices")
     parser.add_argument("--out", type=Path, required=True, help="folder for hair.npz, guides.npz, head.obj and the report")
     parser.add_argument("--preset", choices=list(PRESETS), default="standard", help="speed against quality")
@@ -118,7 +123,7 @@ def _add_reconstruct(commands) -> None:
 
 
 def _add_inspect(commands) -> None:
-    parser = _add_command(commands, "inspect", _inspect, "look at a scan: its size, histogram and thresholds")
+    parser = add_command(commands, "inspect", _inspect, "look at a scan: its size, histogram and thresholds")
     parser.add_argument("scan", type=Path, help="the CT volume")
     parser.add_argument("--out", type=Path, metavar="FILE", help="also keep histogram and a small copy as .npz")
     parser.add_argument("--settings", type=Path, help="JSON file of settings")
@@ -152,7 +157,7 @@ SCAN_ENDINGS = (".vdb", ".npy", ".raw", ".tif", ".tiff", ".nii", ".nii.gz", ".nr
 
 
 def _add_batch(commands) -> None:
-    parser = _add_command(commands, "batch", _batch, "reconstruct many scans; one that fails doesn't stop the others")
+    parser = add_command(commands, "batch", _batch, "reconstruct many scans; one that fails doesn't stop the others")
     parser.add_argument("source", type=Path, help="a folder of scans, or a JSON file: [{scan, name, preset, settings}, ...]")
     parser.add_argument("--out", type=Path, required=True, help="folder; each scan's result goes to a folder of its name in it")
     parser.add_argument("--preset", choices=list(PRESETS), default="standard", help="where the JSON names none")
@@ -318,7 +323,7 @@ class TerminalObserver:
 
 
 def _add_synthesize(commands) -> None:
-    parser = _add_command(commands, "synthesize", _synthesize, "make a raw CT scan of a procedural hairstyle or of strands")
+    parser = add_command(commands, "synthesize", _synthesize, "make a raw CT scan of a procedural hairstyle or of strands")
     parser.add_argument(
         "hair", metavar="STYLE|STRANDS", help="name of a hairstyle, or a file of strands (.npz .data .bin .hair)"
     )
@@ -369,7 +374,7 @@ def _synthesize(chosen: argparse.Namespace) -> int:
 
 
 def _add_evaluate(commands) -> None:
-    parser = _add_command(commands, "evaluate", _evaluate, "score strands against the truth")
+    parser = add_command(commands, "evaluate", _evaluate, "score strands against the truth")
     parser.add_argument("truth", type=Path, help="the true strands")
     parser.add_argument("result", type=Path, help="the strands to score, in the same frame")
     parser.add_argument("--head", type=Path, metavar="MESH", help="OBJ of the head, for roots and points inside")
@@ -393,7 +398,7 @@ def _evaluate(chosen: argparse.Namespace) -> int:
 
 
 def _add_benchmark(commands) -> None:
-    parser = _add_command(commands, "benchmark", _benchmark, "measure our method and the paper's side by side on made scans")
+    parser = add_command(commands, "benchmark", _benchmark, "measure our method and the paper's side by side on made scans")
     parser.add_argument("name", metavar="NAME", help="quick (minutes), table1, ablation, scale or peers")
     parser.add_argument("--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="folder for scans and results")
     parser.add_argument("--seeds", type=int, nargs="+", default=[101], metavar="N", help="seeds of hair and noise")
@@ -421,7 +426,7 @@ def _benchmark(chosen: argparse.Namespace) -> int:
 
 
 def _add_convert(commands) -> None:
-    parser = _add_command(commands, "convert", _convert, "turn strands from one file format into another")
+    parser = add_command(commands, "convert", _convert, "turn strands from one file format into another")
     parser.add_argument("source", type=Path, help="strands: .npz .bin .data .hair")
     parser.add_argument("target", type=Path, help="the file to write; its ending says the format")
     parser.add_argument("--points", type=int, metavar="N", help="resample each strand to N points")
@@ -447,7 +452,7 @@ def _convert(chosen: argparse.Namespace) -> int:
 
 
 def _add_train_prior(commands) -> None:
-    parser = _add_command(commands, "train-prior", _train_prior, "train the strand prior's network, or measure its weights")
+    parser = add_command(commands, "train-prior", _train_prior, "train the strand prior's network, or measure its weights")
     parser.add_argument("--out", type=Path, metavar="WEIGHTS", help="where the weights go (.safetensors)")
     parser.add_argument("--folder", type=Path, help="keeps the strands and the training's state; the same call goes on there")
     parser.add_argument("--measure", type=Path, metavar="WEIGHTS", help="only measure these weights on held-out strands")
@@ -486,7 +491,7 @@ def _train_prior(chosen: argparse.Namespace) -> int:
 
 
 def _add_study_blending(commands) -> None:
-    parser = _add_command(
+    parser = add_command(
         commands, "study-blending", _study_blending, "hold back strands of hairstyles and blend them by each coder"
     )
     parser.add_argument("styles", nargs="*", metavar="STYLE", help="names of hairstyles; none takes all")

@@ -8,6 +8,7 @@ hair.usda, render.png, report.html, and the job's own files in OUT/job.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import shutil
 import subprocess
@@ -46,6 +47,7 @@ def main() -> int:
     import bpy
 
     install(bpy, out)
+    scene = importlib.import_module(f"{MODULE}.ct2hair_addon.scene")
     properties = bpy.context.scene.ct2hair
     properties.preset = options.preset
     properties.colour = "brown"
@@ -59,10 +61,13 @@ def main() -> int:
     step("exporting .blend, .abc, .usda and the report")
     finished(bpy.ops.ct2hair.export(directory=str(out)))
     step("rendering")
-    finished(quietly(lambda: bpy.ops.ct2hair.render(filepath=str(out / "render.png"), samples=options.samples)))
+    with scene.quiet():
+        outcome = bpy.ops.ct2hair.render(filepath=str(out / "render.png"), samples=options.samples)
+    finished(outcome)
     if options.truth:
         step("rendering the hairstyle itself")
-        quietly(lambda: render_truth(bpy, options, out))
+        with scene.quiet():
+            render_truth(scene, options, out)
 
     names = ["hair.blend", "hair.abc", "hair.usda", "render.png", "report.html"]
     missing = [name for name in names if not (out / name).is_file()]
@@ -105,26 +110,8 @@ def install(bpy, out: Path) -> None:
         raise SystemExit("demo: the extension is installed but not enabled; see the messages above")
 
 
-def quietly(work):
-    """Run `work` with Blender's own chatter on standard output, a line a sample, sent to nowhere."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
-    try:
-        return work()
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
-def render_truth(bpy, options, out: Path) -> None:
+def render_truth(scene, options, out: Path) -> None:
     """The picture of the hairstyle that the scan was made of, in the same studio."""
-    import importlib
-
-    scene = importlib.import_module(f"{MODULE}.ct2hair_addon.scene")
     evaluation = importlib.import_module(f"{MODULE}.ct2hair_addon.evaluation")
     head_data = importlib.import_module(f"{MODULE}.ct2hair_addon.head").template_head()
     strands = evaluation.hairstyle(options.style, head_data, options.strands, SEED)

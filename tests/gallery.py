@@ -12,8 +12,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-from demo import quietly
-
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 OUT = ROOT / "docs" / "hairstyles"
@@ -63,9 +61,8 @@ def render(name: str, options: argparse.Namespace) -> None:
         pictures = []
         for view in VIEWS:
             path = Path(folder) / f"{view}.png"
-            quietly(lambda path=path, view=view: scene.render_picture(
-                result, path, view=view, samples=options.samples, size=options.size
-            ))  # fmt: skip
+            with scene.quiet():
+                scene.render_picture(result, path, view=view, samples=options.samples, size=options.size)
             pictures.append(np.asarray(Image.open(path).convert("RGB")))
     # 256 colours are a third of the bytes and look the same
     small = Image.fromarray(np.concatenate(pictures, axis=1)).quantize(256)

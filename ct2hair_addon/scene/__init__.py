@@ -22,6 +22,7 @@ from .looks import histogram_picture, slice_picture, threshold_values
 from .materials import DENSITY_PRESETS, HAIR_COLOURS, set_density_colours, set_hair_colour
 from .picture import render_picture, render_turntable
 from .placing import LANDMARK_OF, add_landmarks, fit_to_landmarks, landmarks_of, placement
+from .quiet import quiet
 from .results import ROLE, HairResult, ScanResult, active_result, result_of, results
 from .session import (
     FORMATS,
@@ -35,6 +36,7 @@ from .session import (
     import_strands,
     load_result,
     load_stage,
+    new_file,
     reconstruct,
     scan_name,
     show_strands,
@@ -86,10 +88,12 @@ __all__ = [
     "mark_scalp_by_selection",
     "measure_regions",
     "measured_regions",
+    "new_file",
     "new_hair",
     "new_head",
     "new_volume",
     "placement",
+    "quiet",
     "reconstruct",
     "regrow",
     "remove_collection",

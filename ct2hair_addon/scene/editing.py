@@ -160,7 +160,12 @@ def regrow(result: HairResult, region: str = "all", count: int = 0, seed: int = 
         raise CT2HairError(f"no strand could be grown in the region '{region}': its guides are too few")
     shared = set(grown.strand_attributes) & set(strands.strand_attributes)
     old = strands.select(~here)
-    parts = [Strands(part.points, part.offsets, _only(part.strand_attributes, shared), {}) for part in (old, grown)]
+    support = grown.strand_attributes.get("support")
+    backed = {} if support is None else {"support": np.repeat(support, grown.counts)}
+    parts = [
+        Strands(part.points, part.offsets, _only(part.strand_attributes, shared), _only(points, ("support",)))
+        for part, points in ((old, old.point_attributes), (grown, backed))
+    ]
     _replace_hair(result, concatenate(parts))
     return len(grown)
 

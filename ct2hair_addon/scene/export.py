@@ -19,7 +19,7 @@ from ..errors import CT2HairError
 from ..strand_files import write_strands
 from ..strands import Strands
 from .frames import MM
-from .hair import strands_of, usable
+from .hair import named_apart, strands_of, usable
 from .head import SCALP_UV
 from .results import HairResult
 
@@ -253,7 +253,7 @@ class _CurvesWriter:
         if "root_uv" in strands.strand_attributes:
             self._put("groom_root_uv", strands.strand_attributes["root_uv"], uniform)
         self._put("groom_width", widths, vertex)
-        for attributes, scope in ((strands.strand_attributes, uniform), (strands.point_attributes, vertex)):
+        for attributes, scope in ((named_apart(strands), uniform), (strands.point_attributes, vertex)):
             for key, values in attributes.items():
                 if key not in _RESERVED:
                     self._put(key, values, scope)

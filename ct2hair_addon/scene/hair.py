@@ -40,6 +40,8 @@ WIDTH_INPUT = "Width"
 INTERNAL = "ct2hair_"
 """Attributes of such names serve the scene's modifiers and are no part of the strands."""
 _ATTACHED = "surface_uv_coordinate"
+PER_STRAND = "strand_"
+"""Before the name of a per-strand attribute where a per-point one has the same: the scene and exports know one of a name."""
 _CURVE_ATTRIBUTES = {"FLOAT": (), "INT": (), "FLOAT2": (2,), "FLOAT_VECTOR": (3,)}
 
 
@@ -85,7 +87,7 @@ def new_hair(
     Strands of fewer than two points, or with a point that is not finite, are left out and counted: importers of grooms break
     on them. Where the strands have no `root_uv`, the closest point of the scalp gives it (`head_data` saves reading the mesh).
     Attributes: radius (POINT, m), surface_uv_coordinate, group_id and every per-strand array of the strands (CURVE), every
-    per-point one (POINT). diameter: mean, mm.
+    per-point one (POINT); where there are both of a name, `strand_support`, say, is the strand's. diameter: mean, mm.
     """
     strands, tally = usable(strands)
     if not len(strands):
@@ -107,7 +109,7 @@ def new_hair(
     write_attribute(curves, _ATTACHED, "FLOAT2", "CURVE", uv)
     groups = strands.strand_attributes.get("group_id", np.full(len(strands), group_id))
     write_attribute(curves, "group_id", "INT", "CURVE", groups)
-    for domain, attributes in (("CURVE", strands.strand_attributes), ("POINT", strands.point_attributes)):
+    for domain, attributes in (("CURVE", named_apart(strands)), ("POINT", strands.point_attributes)):
         for key, values in attributes.items():
             if key not in ("root_uv", "group_id", "radius", "position"):
                 _write_array(curves, key, domain, np.asarray(values))
@@ -147,7 +149,16 @@ def strands_of(ob: bpy.types.Object, evaluated: bool = False) -> Strands:
             (strand if attribute.domain == "CURVE" else point)[attribute.name] = values
     if _ATTACHED in strand:
         strand["root_uv"] = strand.pop(_ATTACHED)
+    for name in point:
+        if PER_STRAND + name in strand:
+            strand[name] = strand.pop(PER_STRAND + name)
     return Strands(points.reshape(-1, 3) / np.float32(MM), offsets, strand, point)
+
+
+def named_apart(strands: Strands) -> dict[str, np.ndarray]:
+    """The per-strand attributes, those that a per-point one has the name of under `PER_STRAND`."""
+    points = strands.point_attributes
+    return {PER_STRAND + name if name in points else name: values for name, values in strands.strand_attributes.items()}
 
 
 def usable(strands: Strands) -> tuple[Strands, dict[str, int]]:

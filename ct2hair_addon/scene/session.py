@@ -26,7 +26,7 @@ from mathutils import Matrix
 from .. import __version__, jobs
 from ..cache import cache_folder
 from ..errors import Cancelled, CT2HairError, ScanError
-from ..head import Head, HeadMesh, fit_to_roots, load_obj, template_head, unwrap
+from ..head import Head, HeadMesh, fit_to_roots, load_obj, mark_scalp, template_head, unwrap
 from ..progress import Progress, silent
 from ..settings import Settings
 from ..strand_files import read_strands
@@ -58,6 +58,18 @@ def default_folder(scan: str | Path) -> Path:
     """Where the results of a scan go unless told otherwise: beside the saved .blend, else in the user's cache folder."""
     base = Path(bpy.path.abspath("//")) / "ct2hair" if bpy.data.filepath else cache_folder() / "jobs"
     return base / scan_name(scan)
+
+
+def new_file(frames: tuple[int, int] | None = None) -> None:
+    """An empty file in place of the one that is open, whose changes are lost; add-ons and preferences stay.
+
+    frames: (first, last) of its scene, which stands at the first.
+    """
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    if frames is not None:
+        scene = bpy.context.scene
+        scene.frame_start, scene.frame_end = frames
+        scene.frame_set(frames[0])
 
 
 def import_scan(
@@ -433,7 +445,7 @@ def import_strands(
     *,
     unit: str = "auto",
     up: str = "z",
-    head: bpy.types.Object | None = None,
+    head: bpy.types.Object | HeadMesh | None = None,
     name: str | None = None,
     colour: str = "brown",
     diameter: float = DIAMETER,
@@ -443,7 +455,8 @@ def import_strands(
 
     unit: mm, cm, m, or auto, which takes the one by which the hair is as large as hair is. up: z (face to -y), or y (face to
     +z) as in USC-HairSalon's and Cem Yuksel's files. head: a mesh with a vertex group 'scalp' that the strands, in the scene's
-    coordinates, already fit; None fits the built-in mannequin to the roots. Raises CT2HairError; the scene is then untouched.
+    coordinates, already fit; or a HeadMesh in the file's own unit and axes, its scalp where the roots are if it has none; None
+    fits the built-in mannequin to the roots. Raises CT2HairError; the scene is then untouched.
     """
     path = Path(path)
     strands = read_strands(path)
@@ -458,7 +471,10 @@ def import_strands(
     if up == "y":
         place = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ place
     strands = strands.transformed(place)
-    if head is not None:
+    if isinstance(head, HeadMesh):
+        mesh = head.transformed(place)
+        mesh = mesh if len(mesh.scalp_faces) else mark_scalp(mesh, strands.roots)
+    elif head is not None:
         mesh = head_mesh(head, evaluated=True)
         world = np.diag([1 / MM, 1 / MM, 1 / MM, 1.0]) @ np.array(head.matrix_world) @ np.diag([MM, MM, MM, 1.0])
         mesh = mesh.transformed(world)

@@ -112,6 +112,9 @@ def job_folder(tmp_path, dome) -> Path:
     rigid = place.copy()
     rigid[:3, :3] /= SCALE
     strands, *_ = strands_on(dome, 200)
+    # as the refinement leaves it: a support per strand and one per point
+    backed = np.random.default_rng(2).random(len(strands.points)).astype(np.float32)
+    strands = Strands(strands.points, strands.offsets, strands.strand_attributes, {"support": backed})
     strands.transformed(rigid).save(folder / "hair.npz")
     strands_on(dome, 20, seed=1)[0].transformed(rigid).save(folder / "guides.npz")
     dome.transformed(rigid).save(folder / "head.obj")

@@ -39,6 +39,8 @@ def test_regions_part_the_scalp_and_know_left_from_right(result, dome):
     assert sum(measured[name].strands for name in scene.REGIONS) == measured["all"].strands == 200
     assert sum(measured[name].area for name in scene.REGIONS) == pytest.approx(measured["all"].area)
     assert measured["all"].density == pytest.approx(200 / measured["all"].area)
+    backed = Strands.load(result.folder / "hair.npz").strand_attributes["support"]
+    assert measured["all"].support == pytest.approx(backed.mean())
     from ct2hair_addon.scene.editing import region_of
 
     points = np.array([[0, -80, 40], [0, 0, 90], [80, 0, 40], [-80, 0, 40], [0, 80, 40]], float)
@@ -83,6 +85,10 @@ def test_a_region_grows_anew_from_the_guides(result):
     assert np.count_nonzero(region_of(after.roots, mesh) == crown) == 30
     others = region_of(before.roots, mesh) != crown
     np.testing.assert_allclose(after.roots[: np.count_nonzero(others)], before.roots[others], atol=1e-4)
+    grown = after.select(np.arange(len(after) - 30, len(after)))  # guides of the region, and what was made up from them
+    support = grown.strand_attributes["support"]
+    assert 0 < np.count_nonzero(support) < 10
+    np.testing.assert_array_equal(grown.point_attributes["support"], np.repeat(support, grown.counts))
     bpy.data.objects.remove(result.guides)
     with pytest.raises(RuntimeError, match="no guides"):
         attempt("regrow", region="crown")

@@ -89,8 +89,13 @@ def test_alembic_holds_the_groom_attributes_that_unreal_reads(result, tmp_path, 
         width, scope = values("Float", "groom_width")
         assert scope == vertex
         np.testing.assert_allclose(width, 2 * scale * strands.point_attributes["radius"], rtol=1e-5)
-        support, _ = values("Float", "support")
+        support, scope = values("Float", "support" if guide else "strand_support")
+        assert scope == uniform
         np.testing.assert_allclose(support, strands.strand_attributes["support"])
+        if not guide:
+            support, scope = values("Float", "support")
+            assert scope == vertex
+            np.testing.assert_allclose(support, strands.point_attributes["support"])
     assert not wanted
 
 
@@ -150,7 +155,8 @@ def test_usd_holds_widths_and_primvars(result, tmp_path):
     np.testing.assert_allclose(hair.GetWidthsAttr().Get(), 2 * radius, rtol=1e-4)
     assert hair.GetTypeAttr().Get() == "linear"
     primvars = UsdGeom.PrimvarsAPI(hair)
-    for name in ("support", "group_id", "surface_uv_coordinate"):
+    assert primvars.GetPrimvar("support").GetInterpolation() == "vertex"
+    for name in ("strand_support", "group_id", "surface_uv_coordinate"):
         assert primvars.GetPrimvar(name).GetInterpolation() == "uniform", name
         assert len(primvars.GetPrimvar(name).Get()) == 200
 

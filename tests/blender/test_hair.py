@@ -27,8 +27,11 @@ def build(dome, strands, **options):
 
 def test_strands_come_back_with_their_attributes(dome):
     strands, *_ = strands_on(dome, 50)
+    backed = np.random.default_rng(5).random(len(strands.points)).astype(np.float32)
+    strands = Strands(strands.points, strands.offsets, strands.strand_attributes, {"support": backed})  # a name used twice
     _, made = build(dome, strands, group_id=4)
     back = strands_of(made.object)
+    np.testing.assert_array_equal(back.point_attributes["support"], backed)
     np.testing.assert_allclose(back.points, strands.points, atol=2e-5)
     np.testing.assert_array_equal(back.offsets, strands.offsets)
     np.testing.assert_array_equal(back.strand_attributes["root_uv"], strands.strand_attributes["root_uv"])

@@ -66,6 +66,17 @@ strands = [len(ob.data.curves) for ob in bpy.context.scene.objects if ob.type ==
 assert strands and max(strands) > 1000, strands
 """
 
+GROOM = """
+import sys
+from pathlib import Path
+from bl_ext.user_default.ct2hair.operators import command
+
+folder = Path(sys.argv[1])
+assert command.run(["groom", str(folder), "--out", str(folder / "groom"), "--trim", "80", "--formats", "npz", "usd"]) == 0
+assert {"hair.npz", "hair.usda"} < {path.name for path in (folder / "groom").iterdir()}
+assert command.run(["groom", str(folder)]) == 2
+"""
+
 DISABLE = """
 assert dir(bpy.ops.ct2hair), "no operator of the extension is registered"
 addon_utils.disable("bl_ext.user_default.ct2hair", default_set=True)
@@ -103,6 +114,7 @@ def test_the_zip_alone_reconstructs_a_scan(blender45):
     command = ["synthesize", "pixie", "--spacing", "0.8", "--strands", "2000", "--seed", "1", "--out", str(scan)]
     blender45.run_enabled(f"from bl_ext.user_default.ct2hair.ct2hair_addon import cli\nassert cli.main({command!r}) == 0\n")
     blender45.run_enabled(RECONSTRUCT, str(scan), str(blender45.folder / "result"))
+    blender45.run_enabled(GROOM, str(blender45.folder / "result"))
 
 
 def test_the_strand_prior_s_weights_are_among_what_users_get(tmp_path):
