@@ -37,8 +37,12 @@ MOTION = "motion"
 """Role of the object that plays the guides' motion."""
 NEAREST = 3
 """Guides that a point of the hair follows."""
-WEIGHTS, PLACE = "ct2hair_weights", "ct2hair_place_{}"
-"""Attributes of the hair: weights of its guides (CURVE), and where on each of them a point is (POINT)."""
+WEIGHTS, PLACE, HEIGHT = "ct2hair_weights", "ct2hair_place_{}", "ct2hair_height"
+"""Attributes of the hair: weights of its guides (CURVE), where on each of them a point is, and its distance from the head at
+rest, m (both POINT)."""
+REACHED = 0.003
+"""m; only points that have moved by their distance from the head less this can be in it, and are looked up there: by far the
+costliest of what is done to each in every frame."""
 REST = "rest"
 """Attribute of the motion's mesh: the points without any motion."""
 PC2 = struct.Struct("<12siiffi")
@@ -80,10 +84,11 @@ def simulate(
         raise CT2HairError(f"frames {first} to {last}: a simulation needs two frames or more; set the last one higher")
     cache = Path(cache) if cache else _default_cache(result)
     guides = _guides(result, settings)
+    obstacle = Obstacle.of(Head(head_mesh(result.head)))
     before = scene.frame_current
     shown = _set_following(result, False)
     try:
-        samples = _run(result, guides, settings, first, last, progress)
+        samples = _run(result, guides, settings, obstacle, first, last, progress)
         inside = float(np.mean(_inside(result, samples[-1][0])))
     finally:
         scene.frame_set(before)
@@ -100,7 +105,7 @@ def simulate(
         attach(playing, result.head)
         for ob in (result.hair, result.guides):
             if ob is not None:
-                _bind(ob, guides, settings.points)
+                _bind(ob, guides, settings.points, obstacle)
                 modifier = ob.modifiers.new(MODIFIER, "NODES")
                 modifier.node_group = group
                 set_modifier_input(modifier, "Guides", playing)
@@ -123,7 +128,7 @@ def clear_simulation(result: HairResult) -> bool:
     for ob in (result.hair, result.guides):
         for modifier in [m for m in ob.modifiers if _follows(m)] if ob is not None else []:
             ob.modifiers.remove(modifier)
-        for name in (WEIGHTS, *(PLACE.format(k) for k in range(NEAREST))) if ob is not None else ():
+        for name in (WEIGHTS, HEIGHT, *(PLACE.format(k) for k in range(NEAREST))) if ob is not None else ():
             if (attribute := ob.data.attributes.get(name)) is not None:
                 ob.data.attributes.remove(attribute)
     meshes = [ob.data for ob in playing]
@@ -160,13 +165,15 @@ def _guides(result: HairResult, settings: SimulationSettings) -> Strands:
     return Strands.from_array(strands.resampled(settings.points), **uv)
 
 
-def _run(result, guides: Strands, settings, first: int, last: int, progress: Progress) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both."""
+def _run(
+    result, guides: Strands, settings, obstacle: Obstacle, first: int, last: int, progress: Progress
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both. obstacle: the head at rest."""
     scene = bpy.context.scene
     rest = guides.points.reshape(-1, settings.points, 3).astype(np.float64)
     seconds = scene.render.fps_base / scene.render.fps
     gravity = np.array(scene.gravity) if scene.use_gravity else np.zeros(3)
-    shape = obstacle = simulation = None
+    shape, simulation = _vertices(result.head.data), None
     samples = []
     follower = _Follower(result, guides)
     try:
@@ -177,7 +184,7 @@ def _run(result, guides: Strands, settings, first: int, last: int, progress: Pro
             if not np.allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-3):
                 raise CT2HairError("the head is scaled: apply its scale (Ctrl A) before a simulation")
             vertices = _shown_vertices(result.head)
-            if shape is None or not np.array_equal(vertices, shape):
+            if not np.array_equal(vertices, shape):
                 shape, obstacle = vertices, Obstacle.of(Head(head_mesh(result.head, evaluated=True)))
             local = follower.points().reshape(rest.shape)
             world = local @ place[:3, :3].T + place[:3, 3]
@@ -196,13 +203,16 @@ def _run(result, guides: Strands, settings, first: int, last: int, progress: Pro
 def _shown_vertices(ob: bpy.types.Object) -> np.ndarray:
     """(V * 3,) float32: the vertices of a mesh object as the scene shows it, in its own frame."""
     source = ob.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    mesh = source.to_mesh()
     try:
-        vertices = np.empty(len(mesh.vertices) * 3, np.float32)
-        mesh.vertices.foreach_get("co", vertices)
-        return vertices
+        return _vertices(source.to_mesh())
     finally:
         source.to_mesh_clear()
+
+
+def _vertices(mesh: bpy.types.Mesh) -> np.ndarray:
+    vertices = np.empty(len(mesh.vertices) * 3, np.float32)
+    mesh.vertices.foreach_get("co", vertices)
+    return vertices
 
 
 class _Follower:
@@ -268,8 +278,9 @@ def _new_motion(new: NewData, result: HairResult, guides: Strands, cache: Path, 
     return ob
 
 
-def _bind(ob: bpy.types.Object, guides: Strands, points: int) -> None:
-    """Note in a hair object's attributes which guides each strand follows, how much, and where along them each point is.
+def _bind(ob: bpy.types.Object, guides: Strands, points: int, head: Obstacle) -> None:
+    """Note in a hair object's attributes which guides each strand follows, how much, and where along them each point is; and
+    how far from the head.
 
     A point follows its guide at its own distance from the root, its end where the guide is shorter; what stands on a guide's
     root follows that guide alone.
@@ -283,6 +294,7 @@ def _bind(ob: bpy.types.Object, guides: Strands, points: int) -> None:
     weights[:, :nearest] = 1.0 / (distance + 1e-3) ** 2  # 1 micrometre: on the root itself
     weights /= weights.sum(axis=1, keepdims=True)
     write_attribute(ob.data, WEIGHTS, "FLOAT_VECTOR", "CURVE", weights)
+    write_attribute(ob.data, HEIGHT, "FLOAT", "POINT", MM * head.distances(strands.points))
     arc, strand = strands.arc_lengths(), strands.strand_index
     for k in range(NEAREST):
         guide = index[:, min(k, nearest - 1)][strand]
@@ -322,8 +334,8 @@ def _follow_group(new: NewData) -> bpy.types.NodeTree:
     socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     build = _Nodes(group)
     entry, leave = build.node("NodeGroupInput"), build.node("NodeGroupOutput")
-    moved = _add_motion(build, entry)
-    lifted = _add_lift(build, entry, moved)
+    moved, motion = _add_motion(build, entry)
+    lifted = _add_lift(build, entry, moved, motion)
     build.link(lifted, leave.inputs["Geometry"])
     return group
 
@@ -371,7 +383,7 @@ class _Nodes:
 
 
 def _add_motion(build: _Nodes, entry):
-    """Nodes that move each point by the motion of its guides; the geometry's socket."""
+    """Nodes that move each point by the motion of its guides; the sockets of the geometry and of the motion."""
     guides = build.node("GeometryNodeObjectInfo", transform_space="RELATIVE")
     build.link(entry.outputs["Guides"], guides.inputs["Object"])
     position = build.node("GeometryNodeInputPosition")
@@ -395,11 +407,14 @@ def _add_motion(build: _Nodes, entry):
     move = build.node("GeometryNodeSetPosition")
     build.link(entry.outputs["Geometry"], move.inputs["Geometry"])
     build.link(total, move.inputs["Offset"])
-    return move.outputs["Geometry"]
+    return move.outputs["Geometry"], total
 
 
-def _add_lift(build: _Nodes, entry, geometry):
-    """Nodes that move points in the head, roots left alone, to the closest skin; the geometry's socket."""
+def _add_lift(build: _Nodes, entry, geometry, motion):
+    """Nodes that move points in the head, roots left alone, to the closest skin; the geometry's socket.
+
+    A node looks up values for the points alone that it moves: so all that could be in the head are moved, most to where they are.
+    """
     head = build.node("GeometryNodeObjectInfo", transform_space="RELATIVE")
     build.link(entry.outputs["Head"], head.inputs["Object"])
     near = build.node("GeometryNodeProximity", target_element="FACES")
@@ -417,9 +432,12 @@ def _add_lift(build: _Nodes, entry, geometry):
     close = build.math("LESS_THAN", near.outputs["Distance"], 0.03)
     along = build.node("GeometryNodeSplineParameter")
     no_root = build.math("GREATER_THAN", along.outputs["Factor"], 0.0)
-    chosen = build.math("MULTIPLY", build.math("MULTIPLY", low, close), no_root)
+    reach = build.math("ADD", build.vector("LENGTH", motion), REACHED)
+    might = build.math("MULTIPLY", build.math("LESS_THAN", build.attribute(HEIGHT, "FLOAT"), reach), no_root)
+    wanted = build.vector("ADD", skin, build.scaled(outward, entry.outputs["Clearance"]))
+    way = build.scaled(build.vector("SUBTRACT", wanted, position), build.math("MULTIPLY", low, close))
     lift = build.node("GeometryNodeSetPosition")
     build.link(geometry, lift.inputs["Geometry"])
-    build.link(chosen, lift.inputs["Selection"])
-    build.link(build.vector("ADD", skin, build.scaled(outward, entry.outputs["Clearance"])), lift.inputs["Position"])
+    build.link(might, lift.inputs["Selection"])
+    build.link(way, lift.inputs["Offset"])
     return lift.outputs["Geometry"]
