@@ -273,7 +273,7 @@ def nearest_one(boxes, child, first, count, corners, x, y, z, reach2):
     return best, best_slot, best_v, best_w
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _nearest(points, boxes, child, first, count, order, corners, reach, distance, face, bary):
     for n in numba.prange(len(points)):
         d2, slot, v, w = nearest_one(
@@ -323,7 +323,7 @@ def winding_one(boxes, child, first, count, corners, centre, dipole, radius, x, 
     return total
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _winding(points, boxes, child, first, count, corners, centre, dipole, radius, winding):
     for n in numba.prange(len(points)):
         winding[n] = winding_one(

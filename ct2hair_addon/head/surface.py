@@ -225,7 +225,7 @@ def inside_one(boxes, child, first, count, corners, centre, dipole, radius, low,
     return winding_one(boxes, child, first, count, corners, centre, dipole, radius, x, y, z) > 0.5
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _signed_distance(points, boxes, child, first, count, order, corners, centre, dipole, radius, low, sides, out):
     for n in numba.prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -274,7 +274,7 @@ def _cell(value):
     return min(max(int(value * CELLS), 0), CELLS - 1)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _on_texture(uv, corners, start, items, slot, bary):
     for n in numba.prange(len(uv)):
         u, v = uv[n, 0], uv[n, 1]

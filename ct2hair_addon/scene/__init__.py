@@ -43,7 +43,7 @@ from .session import (
     start_inspection,
     start_job,
 )
-from .simulation import SimulationResult, clear_simulation, simulate, simulated_frames
+from .simulation import SimulationResult, clear_simulation, simulate, simulated_frames, simulation_steps
 from .staging import NewData, remove_collection
 from .volume import GridSummary, new_volume, summarize
 
@@ -111,6 +111,7 @@ __all__ = [
     "show_strands",
     "simulate",
     "simulated_frames",
+    "simulation_steps",
     "slice_picture",
     "start_inspection",
     "start_job",

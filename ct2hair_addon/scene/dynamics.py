@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from ..head import Head
+from ..head import Head, HeadMesh
 from ..settings import SimulationSettings
 
 SUBSTEPS = 8
@@ -40,13 +40,26 @@ class Obstacle:
     distance: np.ndarray
 
     @classmethod
-    def of(cls, head: Head) -> Obstacle:
-        """The table of `head`, in its own frame."""
-        vertices = head.mesh.vertices.astype(np.float64)
+    def around(cls, mesh: HeadMesh) -> Obstacle:
+        """The table of a head in its own frame, yet to be filled."""
+        vertices = mesh.vertices.astype(np.float64)
         low = vertices.min(axis=0) - REACH
         size = np.ceil((vertices.max(axis=0) + REACH - low) / GRID).astype(int) + 1
-        nodes = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3) * GRID + low
-        return cls(low, GRID, np.ascontiguousarray(head.signed_distance(nodes).reshape(size)))
+        return cls(low, GRID, np.full(size, np.nan, np.float32))
+
+    @classmethod
+    def of(cls, head: Head) -> Obstacle:
+        """The table of `head`, in its own frame."""
+        table = cls.around(head.mesh)
+        table.fill(head, 0, len(table.distance))
+        return table
+
+    def fill(self, head: Head, first: int, last: int) -> None:
+        """Measure the layers `first` to `last` across x: all of them take seconds."""
+        layers = self.distance[first:last]
+        nodes = np.indices(layers.shape).reshape(3, -1).T * GRID + self.low
+        nodes[:, 0] += first * GRID
+        layers[:] = head.signed_distance(nodes).reshape(layers.shape)
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """(M,) float64 mm at points (M, 3) in the head's frame; `REACH` outside the table."""
@@ -115,7 +128,7 @@ def _sampled(low, spacing, table, x, y, z):
     return value, gx / spacing, gy / spacing, gz / spacing
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _distances(points, low, spacing, table):
     out = np.empty(len(points))
     for m in numba.prange(len(points)):
@@ -178,7 +191,7 @@ def _keep_out(x, before, low, spacing, table, rotation, shift):
             before[i] = x[i] - GLIDE * (x[i] - before[i])
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, nogil=True)
 def _advance(
     points, before, rest_then, rest_now, low, spacing, table, rotation, shift, dt, gravity, wind, drag, stiffness, hold
 ):

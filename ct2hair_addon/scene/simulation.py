@@ -7,9 +7,14 @@ renders and exports in any Blender without this extension. The solver is in `dyn
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import itertools
 import struct
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -17,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from .. import __version__
 from ..errors import CT2HairError
-from ..head import Head
+from ..head import Head, HeadMesh
 from ..progress import Progress, silent
 from ..settings import SimulationSettings
 from ..strands import Strands
@@ -43,6 +48,8 @@ rest, m (both POINT)."""
 REACHED = 0.003
 """m; only points that have moved by their distance from the head less this can be in it, and are looked up there: by far the
 costliest of what is done to each in every frame."""
+OBSTACLE_STEPS = 16
+"""Steps that the head is measured in, so that a step is short."""
 REST = "rest"
 """Attribute of the motion's mesh: the points without any motion."""
 PC2 = struct.Struct("<12siiffi")
@@ -63,6 +70,12 @@ class SimulationResult:
     inside: float
 
 
+Work = Callable[[], Any]
+Steps = Generator[tuple[float, Work], Any, SimulationResult]
+"""A simulation under way: gives (share done, work) and takes what the work returned. The work knows no Blender, so it may run
+in a thread of its own."""
+
+
 def simulate(
     result: HairResult,
     settings: SimulationSettings | None = None,
@@ -77,6 +90,26 @@ def simulate(
     folder by default. A simulation that was there is replaced once the new one is whole. Blocks; progress may raise
     `Cancelled`, and the scene is then as it was. Raises CT2HairError where frames, hair or folder are of no use.
     """
+    with contextlib.closing(simulation_steps(result, settings, frames=frames, cache=cache)) as steps:
+        outcome = None
+        while True:
+            try:
+                share, work = steps.send(outcome)
+            except StopIteration as end:
+                progress(1.0, 1.0)
+                return end.value
+            progress(share, 1.0)
+            outcome = work()
+
+
+def simulation_steps(
+    result: HairResult,
+    settings: SimulationSettings | None = None,
+    *,
+    frames: tuple[int, int] | None = None,
+    cache: str | Path | None = None,
+) -> Steps:
+    """As `simulate`, step by step, for a window that must not wait: see `Steps`. Closed early, it leaves the scene as it was."""
     settings = settings or SimulationSettings()
     scene = bpy.context.scene
     first, last = frames or (scene.frame_start, scene.frame_end)
@@ -84,12 +117,13 @@ def simulate(
         raise CT2HairError(f"frames {first} to {last}: a simulation needs two frames or more; set the last one higher")
     cache = Path(cache) if cache else _default_cache(result)
     guides = _guides(result, settings)
-    obstacle = Obstacle.of(Head(head_mesh(result.head)))
+    obstacle = yield from _obstacle(head_mesh(result.head), 0.0, 0.1)
     before = scene.frame_current
     shown = _set_following(result, False)
     try:
-        samples = _run(result, guides, settings, obstacle, first, last, progress)
-        inside = float(np.mean(_inside(result, samples[-1][0])))
+        samples = yield from _run(result, guides, settings, obstacle, first, last)
+        head, points = head_mesh(result.head, evaluated=True), samples[-1][0]
+        inside = yield 0.9, lambda: float(np.mean(Head(head).signed_distance(points) < -0.01))
     finally:
         scene.frame_set(before)
         _set_following(result, shown)
@@ -97,19 +131,21 @@ def simulate(
     rest = guides.points.reshape(-1, settings.points, 3)
     _write_pc2(cache, motion.reshape(len(motion), -1, 3) * MM, first)
     tip = float(np.linalg.norm(motion[-1].reshape(rest.shape)[:, -1] - rest[:, -1], axis=1).mean())
+    hair = {ob: strands_of(ob) for ob in (result.hair, result.guides) if ob is not None}
+    following = yield 0.95, lambda: [_followed(strands, guides, settings.points, obstacle) for strands in hair.values()]
     with NewData() as new:
         playing = _new_motion(new, result, guides, cache, first)
         group = _follow_group(new)
         clear_simulation(result)
         result.collection.objects.link(playing)
         attach(playing, result.head)
-        for ob in (result.hair, result.guides):
-            if ob is not None:
-                _bind(ob, guides, settings.points, obstacle)
-                modifier = ob.modifiers.new(MODIFIER, "NODES")
-                modifier.node_group = group
-                set_modifier_input(modifier, "Guides", playing)
-                set_modifier_input(modifier, "Head", result.head)
+        for ob, attributes in zip(hair, following, strict=True):
+            for name, kind, domain, values in attributes:
+                write_attribute(ob.data, name, kind, domain, values)
+            modifier = ob.modifiers.new(MODIFIER, "NODES")
+            modifier.node_group = group
+            set_modifier_input(modifier, "Guides", playing)
+            set_modifier_input(modifier, "Head", result.head)
     playing.hide_viewport = playing.hide_render = True
     result.collection["ct2hair_simulation"] = {
         "version": __version__,
@@ -166,9 +202,9 @@ def _guides(result: HairResult, settings: SimulationSettings) -> Strands:
 
 
 def _run(
-    result, guides: Strands, settings, obstacle: Obstacle, first: int, last: int, progress: Progress
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both. obstacle: the head at rest."""
+    result, guides: Strands, settings, obstacle: Obstacle, first: int, last: int
+) -> Generator[tuple[float, Work], Any, list[tuple[np.ndarray, np.ndarray]]]:
+    """Steps to (points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both. obstacle: the head at rest."""
     scene = bpy.context.scene
     rest = guides.points.reshape(-1, settings.points, 3).astype(np.float64)
     seconds = scene.render.fps_base / scene.render.fps
@@ -178,6 +214,7 @@ def _run(
     follower = _Follower(result, guides)
     try:
         for frame in range(first, last + 1):
+            share = 0.1 + 0.8 * (frame - first) / (last - first + 1)
             scene.frame_set(frame)
             place = np.array(result.head.matrix_world, np.float64)
             place[:3, 3] /= MM
@@ -185,19 +222,29 @@ def _run(
                 raise CT2HairError("the head is scaled: apply its scale (Ctrl A) before a simulation")
             vertices = _shown_vertices(result.head)
             if not np.array_equal(vertices, shape):
-                shape, obstacle = vertices, Obstacle.of(Head(head_mesh(result.head, evaluated=True)))
+                shape = vertices
+                obstacle = yield from _obstacle(head_mesh(result.head, evaluated=True), share, share)
             local = follower.points().reshape(rest.shape)
             world = local @ place[:3, :3].T + place[:3, 3]
             if simulation is None:
                 simulation = Simulation(world, settings)
             else:
-                simulation.step(world, obstacle, place, seconds, gravity)
+                yield share, functools.partial(simulation.step, world, obstacle, place, seconds, gravity)
             now = (simulation.points - place[:3, 3]) @ place[:3, :3]
             samples.append((now.reshape(-1, 3).astype(np.float32), (rest + (now - local)).reshape(-1, 3).astype(np.float32)))
-            progress(frame - first + 1, last - first + 1)
     finally:
         follower.remove()
     return samples
+
+
+def _obstacle(mesh: HeadMesh, low: float, high: float) -> Generator[tuple[float, Work], Any, Obstacle]:
+    """Steps, from the share done `low` to `high`, to the head as an obstacle."""
+    table = Obstacle.around(mesh)
+    head = yield low, lambda: Head(mesh)
+    ends = np.linspace(0, len(table.distance), OBSTACLE_STEPS + 1).astype(int)
+    for number, (first, last) in enumerate(itertools.pairwise(ends.tolist())):
+        yield low + (high - low) * number / OBSTACLE_STEPS, functools.partial(table.fill, head, first, last)
+    return table
 
 
 def _shown_vertices(ob: bpy.types.Object) -> np.ndarray:
@@ -250,10 +297,6 @@ class _Follower:
             bpy.data.hair_curves.remove(curves)
 
 
-def _inside(result: HairResult, points: np.ndarray) -> np.ndarray:
-    return Head(head_mesh(result.head, evaluated=True)).signed_distance(points) < -0.01
-
-
 def _write_pc2(path: Path, samples: np.ndarray, first: int) -> None:
     """Write (F, M, 3) positions in metres, a sample a frame from `first` on."""
     with written_beside(path) as beside, beside.open("wb") as file:
@@ -278,14 +321,13 @@ def _new_motion(new: NewData, result: HairResult, guides: Strands, cache: Path, 
     return ob
 
 
-def _bind(ob: bpy.types.Object, guides: Strands, points: int, head: Obstacle) -> None:
-    """Note in a hair object's attributes which guides each strand follows, how much, and where along them each point is; and
-    how far from the head.
+def _followed(strands: Strands, guides: Strands, points: int, head: Obstacle) -> list[tuple[str, str, str, np.ndarray]]:
+    """The attributes (name, type, domain, values) that say which guides each strand follows, how much, and where along them
+    each point is; and how far from the head.
 
     A point follows its guide at its own distance from the root, its end where the guide is shorter; what stands on a guide's
     root follows that guide alone.
     """
-    strands = strands_of(ob)
     roots, lengths = guides.points[::points], np.maximum(guides.lengths(), 1e-6)
     nearest = min(NEAREST, len(guides))
     distance, index = cKDTree(roots).query(strands.roots, k=nearest)
@@ -293,13 +335,16 @@ def _bind(ob: bpy.types.Object, guides: Strands, points: int, head: Obstacle) ->
     weights = np.zeros((len(strands), NEAREST))
     weights[:, :nearest] = 1.0 / (distance + 1e-3) ** 2  # 1 micrometre: on the root itself
     weights /= weights.sum(axis=1, keepdims=True)
-    write_attribute(ob.data, WEIGHTS, "FLOAT_VECTOR", "CURVE", weights)
-    write_attribute(ob.data, HEIGHT, "FLOAT", "POINT", MM * head.distances(strands.points))
     arc, strand = strands.arc_lengths(), strands.strand_index
+    attributes = [
+        (WEIGHTS, "FLOAT_VECTOR", "CURVE", weights),
+        (HEIGHT, "FLOAT", "POINT", MM * head.distances(strands.points)),
+    ]
     for k in range(NEAREST):
         guide = index[:, min(k, nearest - 1)][strand]
         place = guide * points + np.minimum(arc / lengths[guide], 1.0) * (points - 1)
-        write_attribute(ob.data, PLACE.format(k), "FLOAT", "POINT", place)
+        attributes.append((PLACE.format(k), "FLOAT", "POINT", place))
+    return attributes
 
 
 def _follows(modifier: bpy.types.Modifier) -> bool:

@@ -151,3 +151,26 @@ def block_counts() -> dict[str, int]:
     """How many data-blocks of each kind the file holds: the same before and after what must leave the scene alone."""
     kinds = ("objects", "meshes", "hair_curves", "volumes", "materials", "collections", "node_groups", "scenes", "worlds")
     return {kind: len(getattr(bpy.data, kind)) for kind in (*kinds, "cameras", "lights")}
+
+
+class Window:
+    """A context with a window, whose timer and status bar the test looks at, since bpy has none."""
+
+    def __init__(self):
+        self.status, self.timers, self.handlers = None, [], []
+        self.scene, self.view_layer, self.window = bpy.context.scene, bpy.context.view_layer, None
+        self.window_manager = self.workspace = self
+
+    def event_timer_add(self, interval, window=None):
+        assert 0.01 <= interval <= 0.2
+        self.timers.append(interval)
+        return interval
+
+    def event_timer_remove(self, timer):
+        self.timers.remove(timer)
+
+    def modal_handler_add(self, operator):
+        self.handlers.append(operator)
+
+    def status_text_set(self, text):
+        self.status = text

@@ -12,7 +12,7 @@ import pytest
 
 from ct2hair_addon.settings import PRESETS, Settings, parameters
 
-from .conftest import block_counts
+from .conftest import Window, block_counts
 
 pytestmark = pytest.mark.usefixtures("extension")
 OPERATORS = ("import_scan", "reconstruct", "cancel", "load_result", "export", "render", "hair_colour")
@@ -172,29 +172,6 @@ def test_a_cancelled_job_leaves_the_scene(extension, stand_in, job_folder):
     assert bpy.ops.ct2hair.reconstruct(scan=str(job_folder / "volume.vdb"), folder=str(job_folder)) == {"CANCELLED"}
     assert block_counts() == before
     assert not extension.operators.running.current.failed
-
-
-class Window:
-    """A context with a window, whose timer and status bar the test looks at, since bpy has none."""
-
-    def __init__(self):
-        self.status, self.timers, self.handlers = None, [], []
-        self.scene, self.view_layer, self.window = bpy.context.scene, bpy.context.view_layer, None
-        self.window_manager = self.workspace = self
-
-    def event_timer_add(self, interval, window=None):
-        assert 0.1 <= interval <= 0.2
-        self.timers.append(interval)
-        return interval
-
-    def event_timer_remove(self, timer):
-        self.timers.remove(timer)
-
-    def modal_handler_add(self, operator):
-        self.handlers.append(operator)
-
-    def status_text_set(self, text):
-        self.status = text
 
 
 @pytest.fixture

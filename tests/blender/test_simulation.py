@@ -1,5 +1,8 @@
 """Hair in motion: roots stay, tips move, nothing goes through the head; it plays and leaves by export."""
 
+import time
+from types import MethodType, SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from ct2hair_addon.head import Head
 from ct2hair_addon.scene.dynamics import Obstacle, Simulation
 from ct2hair_addon.settings import SimulationSettings
 
-from .conftest import block_counts, strands_on
+from .conftest import Window, block_counts, strands_on
 
 
 @pytest.fixture
@@ -115,3 +118,76 @@ def test_alembic_and_usd_hold_the_motion(result, tmp_path):
         positions = np.asarray(memoryview(schema.getValue(Abc.ISampleSelector(frame - 1)).getPositions()))
         np.testing.assert_allclose(positions, 100 * metres, atol=1e-4)
         np.testing.assert_allclose(curves.GetPointsAttr().Get(frame), metres, atol=1e-6)
+
+
+@pytest.fixture
+def modal(extension, result, tmp_path, monkeypatch):
+    """Run the operator as a window would: `start()`, then `step(event type)` -> what modal() returned."""
+    module = extension.operators.simulation
+    monkeypatch.setattr(module, "headless", lambda: False)
+    owner = bpy.context.scene
+    owner.frame_start, owner.frame_end = 1, 8
+    cls, context, reports = module.CT2HAIR_OT_simulate, Window(), []
+    operator = SimpleNamespace(cache=str(tmp_path / "motion.pc2"), report=lambda kind, text: reports.append((*kind, text)))
+    for name in ("_say", "_leave", "_go_on"):
+        setattr(operator, name, MethodType(getattr(cls, name), operator))
+
+    def step(kind, value="NOTHING"):
+        begun = time.perf_counter()
+        outcome = cls.modal(operator, context, SimpleNamespace(type=kind, value=value))
+        held.append(time.perf_counter() - begun)
+        return outcome
+
+    held: list[float] = []
+    start = lambda: cls.execute(operator, context)  # noqa: E731
+    return SimpleNamespace(start=start, step=step, context=context, reports=reports, held=held, operator=operator, cls=cls)
+
+
+def through(modal) -> set[str]:
+    end = time.monotonic() + 120
+    while (outcome := modal.step("TIMER")) == {"RUNNING_MODAL"} and time.monotonic() < end:
+        time.sleep(0.005)
+    return outcome
+
+
+def test_in_a_window_it_runs_beside_the_events_and_gives_the_very_same(modal, result, tmp_path):
+    assert modal.start() == {"RUNNING_MODAL"} and modal.context.timers and modal.context.handlers
+    assert modal.step("MOUSEMOVE") == {"PASS_THROUGH"} and modal.step("LEFTMOUSE", "PRESS") == {"RUNNING_MODAL"}
+    assert through(modal) == {"FINISHED"}
+    assert not modal.context.timers and modal.context.status is None
+    assert modal.reports[-1][0] == "INFO" and "Simulated 60 guides, frames 1 to 8" in modal.reports[-1][1]
+    motion = (tmp_path / "motion.pc2").read_bytes()
+    assert scene.simulated_frames(result) == (1, 8)
+    scene.simulate(result, frames=(1, 8), cache=tmp_path / "again.pc2")
+    assert (tmp_path / "again.pc2").read_bytes() == motion
+
+
+def test_escape_leaves_all_as_it_was(modal, result, tmp_path):
+    before = block_counts()
+    modal.start()
+    for _ in range(30):
+        assert modal.step("TIMER") == {"RUNNING_MODAL"}
+        time.sleep(0.01)
+    begun = time.monotonic()
+    assert modal.step("ESC", "PRESS") == {"RUNNING_MODAL"}
+    assert through(modal) == {"CANCELLED"} and time.monotonic() - begun < 2.0
+    assert block_counts() == before and not modal.context.timers and scene.simulated_frames(result) is None
+    assert bpy.context.scene.frame_current == 1 and not list(tmp_path.iterdir())
+    assert modal.reports[-1][0] == "WARNING"
+
+
+def test_closing_the_window_ends_it(modal, result):
+    before = block_counts()
+    modal.start()
+    modal.cls.cancel(modal.operator, modal.context)
+    assert block_counts() == before and not modal.context.timers
+
+
+def test_an_error_in_the_middle_is_told_and_leaves_all_as_it_was(modal, result, tmp_path):
+    before = block_counts()
+    modal.start()
+    result.head.scale = (2.0, 1.0, 1.0)
+    bpy.context.view_layer.update()
+    assert through(modal) == {"CANCELLED"}
+    assert ("ERROR", "the head is scaled: apply its scale (Ctrl A) before a simulation") in modal.reports
+    assert block_counts() == before and not modal.context.timers and not list(tmp_path.iterdir())
