@@ -16,13 +16,15 @@ import signal
 import sys
 import time
 import traceback
+from argparse import SUPPRESS, BooleanOptionalAction
 from collections.abc import Callable, Sequence
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
 from . import __version__
 from .errors import Cancelled, CT2HairError, explained
-from .settings import PRESETS, STOPS, Settings, parameters
+from .settings import PRESETS, STOPS, Settings, SynthesisSettings, parameters
 
 DONE, REFUSED, WRONG_USAGE, STOPPED = 0, 1, 2, 130
 SHORT_NAMES = {
@@ -88,9 +90,16 @@ def _parser(more: Sequence[Callable[..., None]]) -> argparse.ArgumentParser:
     return parser
 
 
+class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Defaults beside the help, but for those that say nothing."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default in (None, False, []) else super()._get_help_string(action)
+
+
 def add_command(commands, name: str, run: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
     """A command of the command line: run(options) returns its exit code."""
-    parser = commands.add_parser(name, help=help, description=help, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = commands.add_parser(name, help=help, description=help, formatter_class=_HelpFormatter)
     parser.set_defaults(run=run)
     return parser
 
@@ -104,22 +113,21 @@ def _add_reconstruct(commands) -> None:
     parser.add_argument("--until", choices=STOPS, help="stop after this stage; the same call without it goes on from there")
     _add_raw_options(parser)
     for name, known in parameters():
-        short = SHORT_NAMES.get(name)
-        option = short or "--" + name.replace(".", "-").replace("_", "-")
-        unit = f" [{known.metadata['unit']}]" if known.metadata["unit"] else ""
-        text = f"{known.metadata['help']}{unit} (preset's value, {known.default!r} in standard)".replace("%", "%%")
-        if known.type == "bool":
-            parser.add_argument(option, dest=name, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
-            continue
-        parser.add_argument(
-            option,
-            dest=name,
-            type=_TYPES[known.type],
-            choices=known.metadata["choices"] or None,
-            default=argparse.SUPPRESS,
-            metavar=None if known.metadata["choices"] else option.lstrip("-").split("-")[-1].upper(),
-            help=text,
-        )
+        option = SHORT_NAMES.get(name, "--" + name.replace(".", "-").replace("_", "-"))
+        add_parameter(parser, option, name, known, f"preset's value, {known.default!r} in standard")
+
+
+def add_parameter(parser, option: str, dest: str, known: Field, default: str = "") -> None:
+    """An option for a parameter of `settings.py`; left out, nothing is set. default: what that means, else the parameter's."""
+    unit = f" [{known.metadata['unit']}]" if known.metadata["unit"] else ""
+    text = f"{known.metadata['help']}{unit} ({default or f'default: {known.default}'})".replace("%", "%%")
+    common = {"dest": dest, "default": SUPPRESS, "help": text}
+    if known.type == "bool":
+        parser.add_argument(option, action=BooleanOptionalAction, **common)
+    else:
+        choices = known.metadata["choices"] or None
+        name = None if choices else option.lstrip("-").split("-")[-1].upper()
+        parser.add_argument(option, type=_TYPES[known.type], choices=choices, metavar=name, **common)
 
 
 def _add_inspect(commands) -> None:
@@ -333,12 +341,16 @@ def _add_synthesize(commands) -> None:
         "--head", type=Path, metavar="MESH", help="OBJ of the head; without one the template is fitted to the roots"
     )
     parser.add_argument("--strands", type=int, default=8000, metavar="N", help="strands of a hairstyle")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the hairstyle and of the noise")
-    parser.add_argument("--snr", type=float, default=4.0, metavar="S", help="a lone strand's peak over the noise")
-    parser.add_argument("--blur", type=float, default=0.85, metavar="VOXELS", help="the scanner's blur, a Gaussian sigma")
-    parser.add_argument("--clean", action="store_true", help="blurred hair only: no noise, no air, no mannequin, no net")
-    parser.add_argument("--no-mannequin", action="store_true", help="leave the mannequin out")
-    parser.add_argument("--no-net", action="store_true", help="leave the hairnet and its knots out")
+    for known in fields(SynthesisSettings):
+        # --strand would be read for --strands
+        add_parameter(parser, f"--{_SYNTHESIS.get(known.name, known.name).replace('_', '-')}", known.name, known)
+    parser.add_argument(
+        "--no-mannequin", dest="mannequin", action="store_const", const="none", default=SUPPRESS, help="as --mannequin none"
+    )
+
+
+_SYNTHESIS = {"strand": "strand_value"}
+"""Options of `synthesize` that aren't named as their parameter is."""
 
 
 def _synthesize(chosen: argparse.Namespace) -> int:
@@ -346,9 +358,11 @@ def _synthesize(chosen: argparse.Namespace) -> int:
     from .head import load_obj, mark_scalp, template_head
     from .strand_files import read_strands
 
+    known = {field.name for field in fields(SynthesisSettings)}
+    settings = SynthesisSettings().changed({name: value for name, value in vars(chosen).items() if name in known})
     if chosen.hair in STYLES:
         head = load_obj(chosen.head) if chosen.head else template_head()
-        strands = hairstyle(chosen.hair, head, chosen.strands, chosen.seed)
+        strands = hairstyle(chosen.hair, head, chosen.strands, settings.seed)
     elif Path(chosen.hair).suffix:
         strands = read_strands(chosen.hair)
         head = load_obj(chosen.head, align=False, need_scalp=False) if chosen.head else None
@@ -356,18 +370,7 @@ def _synthesize(chosen: argparse.Namespace) -> int:
             head = mark_scalp(head, strands.roots)
     else:
         raise CT2HairError(f"'{chosen.hair}' is neither a hairstyle ({', '.join(STYLES)}) nor a file of strands")
-    made = synthesize(
-        strands,
-        head,
-        chosen.out,
-        chosen.spacing,
-        snr=chosen.snr,
-        clean=chosen.clean,
-        seed=chosen.seed,
-        blur=chosen.blur,
-        mannequin=not chosen.no_mannequin,
-        net=not chosen.no_net,
-    )
+    made = synthesize(strands, head, chosen.out, chosen.spacing, settings=settings)
     voxels = " x ".join(map(str, made.description["shape"]))
     print(f"{len(strands)} strands, {voxels} voxels of {chosen.spacing} mm: {chosen.out}")
     return DONE
@@ -413,8 +416,6 @@ def _add_benchmark(commands) -> None:
 
 
 def _benchmark(chosen: argparse.Namespace) -> int:
-    from dataclasses import fields
-
     from .benchmark import Options, run_benchmark
 
     options = Options(**{known.name: getattr(chosen, known.name) for known in fields(Options)})

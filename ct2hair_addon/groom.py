@@ -10,7 +10,7 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-from .cli import DONE, TerminalObserver, add_command
+from .cli import DONE, TerminalObserver, add_command, add_parameter
 from .errors import CT2HairError
 from .settings import SimulationSettings
 
@@ -54,14 +54,7 @@ def add_groom(commands) -> None:
         "--simulate", nargs=2, type=int, metavar=("FIRST", "LAST"), help="simulate these frames; exports are animated over them"
     )
     for known in fields(SimulationSettings):
-        unit = f" [{known.metadata['unit']}]" if known.metadata["unit"] else ""
-        motion.add_argument(
-            f"--{known.name.replace('_', '-')}",
-            type={"float": float, "int": int}[known.type],
-            metavar=known.name.split("_")[-1].upper(),
-            help=known.metadata["help"].replace("%", "%%") + unit,
-            default=known.default,
-        )
+        add_parameter(motion, f"--{known.name.replace('_', '-')}", known.name, known)
 
     out = parser.add_argument_group("what is written")
     out.add_argument(
@@ -104,7 +97,8 @@ def _groom(chosen: argparse.Namespace) -> int:
         raise CT2HairError(
             f"groom works in Blender: run `blender --command ct2hair groom ...`, or pip install bpy for {sys.executable}"
         ) from None
-    motion = SimulationSettings().changed({known.name: getattr(chosen, known.name) for known in fields(SimulationSettings)})
+    known = {field.name for field in fields(SimulationSettings)}
+    motion = SimulationSettings().changed({name: value for name, value in vars(chosen).items() if name in known})
     _check(scene, chosen)
 
     frames = tuple(chosen.simulate) if chosen.simulate else None

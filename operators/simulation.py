@@ -14,7 +14,15 @@ from .running import headless, redraw, time_left
 
 TICK = 0.02
 """Seconds between two looks at whether a step's work is done."""
-NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "TRACKPADPAN", "TRACKPADZOOM"}
+NAVIGATION = {
+    "MIDDLEMOUSE",
+    "WHEELUPMOUSE",
+    "WHEELDOWNMOUSE",
+    "MOUSEMOVE",
+    "INBETWEEN_MOUSEMOVE",
+    "TRACKPADPAN",
+    "TRACKPADZOOM",
+}
 
 
 class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):

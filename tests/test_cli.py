@@ -1,6 +1,7 @@
 """The command line: options made from the settings, conversions, clear errors and exit codes."""
 
 import json
+from dataclasses import fields
 from unittest.mock import Mock
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from ct2hair_addon import cli
 from ct2hair_addon.cli import main
 from ct2hair_addon.errors import CT2HairError
-from ct2hair_addon.settings import Settings, parameters
+from ct2hair_addon.evaluation import hairstyle
+from ct2hair_addon.head import template_head
+from ct2hair_addon.settings import Settings, SynthesisSettings, parameters
 from ct2hair_addon.strand_files import read_strands, write_strands
 from ct2hair_addon.strands import Strands
 
@@ -67,6 +70,28 @@ def test_every_setting_is_an_option_of_reconstruct(capsys):
         option = cli.SHORT_NAMES.get(name) or "--" + name.replace(".", "-").replace("_", "-")
         assert option in text
         assert known.metadata["help"].split(";")[0].split(",")[0] in text
+
+
+def test_every_parameter_of_a_made_scan_is_an_option_of_synthesize(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["synthesize", "--help"])
+    text = capsys.readouterr().out
+    for known in fields(SynthesisSettings):
+        name = "strand-value" if known.name == "strand" else known.name.replace("_", "-")
+        assert f"--{name} " in text or f"--{name}," in text, name
+    assert "(default: None)" not in text
+    hair = tmp_path / "hair.npz"
+    hairstyle("pixie", template_head(), 300, 1).save(hair)
+    options = ["--spacing", "1.5", "--no-mannequin", "--no-net", "--rings", "2", "--strand-value", "200", "--out"]
+    assert main(["synthesize", str(hair), *options, str(tmp_path / "scan.nrrd")]) == cli.DONE
+    told = json.loads((tmp_path / "scan.json").read_text())["settings"]
+    assert (told["rings"], told["strand"], told["mannequin"], told["net"]) == (2.0, 200.0, "none", False)
+    few = Strands.load(hair).select(np.arange(20))
+    few.save(tmp_path / "few.npz")
+    assert main(["synthesize", str(tmp_path / "few.npz"), *options, str(tmp_path / "few.nrrd")]) == cli.REFUSED
+    assert "20 strands are too few to fit a head to" in capsys.readouterr().err
+    assert main(["synthesize", str(hair), "--spacing", "1", "--snr", "0", "--out", str(tmp_path / "b.nrrd")]) == cli.REFUSED
+    assert "setting 'snr' is 0.0, expected 0.1 to 1000.0" in capsys.readouterr().err
 
 
 def test_a_settings_file_is_laid_over_the_preset(tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from ..errors import ScanError, SettingsError
-from ..head import Head, HeadMesh
+from ..head import Head, HeadMesh, fit_to_roots, template_head
 from ..measure import allowed_memory
 from ..progress import Progress, part, silent
 from ..settings import SynthesisSettings
@@ -96,9 +96,7 @@ def synthesize(
     out = Path(out)
     raw = not chosen.clean
     if head is None:
-        from ..head import fit_to_roots
-
-        head = fit_to_roots(strands.roots)
+        head = fit_to_roots(template_head(), strands.roots).head
     surface = Head(head) if raw and (chosen.net or chosen.mannequin != "none") else None
 
     origin, shape = _box(strands, head if raw and chosen.mannequin != "none" else None, spacing, chosen)

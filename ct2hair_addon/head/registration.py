@@ -156,9 +156,14 @@ def register_head(
 def fit_to_roots(
     template: HeadMesh, roots: np.ndarray, face: str = "-y", up: str = "+z", progress: Progress = silent
 ) -> Registration:
-    """Fit the template to the root points (N, 3), mm, of strands that come without a head; `face`, `up` as in the settings."""
+    """Fit the template to the root points (N, 3), mm, of strands that come without a head; `face`, `up` as in the settings.
+
+    Raises HeadError where they are too few, or show no head.
+    """
     nothing = np.zeros((0, 3))
     roots = np.asarray(roots, np.float64).reshape(-1, 3)
+    if len(roots) < LEAST_POINTS:
+        raise HeadError(f"{len(roots)} strands are too few to fit a head to, {LEAST_POINTS} are needed: give the head's mesh")
     return _registered(template, roots, nothing, nothing, np.zeros(0), orientations(face, up), True, progress)
 
 

@@ -109,7 +109,7 @@ def simulation_steps(
     frames: tuple[int, int] | None = None,
     cache: str | Path | None = None,
 ) -> Steps:
-    """As `simulate`, step by step, for a window that must not wait: see `Steps`. Closed early, it leaves the scene as it was."""
+    """As `simulate`, step by step (`Steps`), for a window that must not wait. Closed early, it leaves the scene as it was."""
     settings = settings or SimulationSettings()
     scene = bpy.context.scene
     first, last = frames or (scene.frame_start, scene.frame_end)
@@ -204,7 +204,10 @@ def _guides(result: HairResult, settings: SimulationSettings) -> Strands:
 def _run(
     result, guides: Strands, settings, obstacle: Obstacle, first: int, last: int
 ) -> Generator[tuple[float, Work], Any, list[tuple[np.ndarray, np.ndarray]]]:
-    """Steps to (points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both. obstacle: the head at rest."""
+    """Steps to (points in the head's frame, rest plus motion) of each frame, (N * P, 3) float32 mm both.
+
+    obstacle: the head at rest.
+    """
     scene = bpy.context.scene
     rest = guides.points.reshape(-1, settings.points, 3).astype(np.float64)
     seconds = scene.render.fps_base / scene.render.fps
@@ -458,7 +461,7 @@ def _add_motion(build: _Nodes, entry):
 def _add_lift(build: _Nodes, entry, geometry, motion):
     """Nodes that move points in the head, roots left alone, to the closest skin; the geometry's socket.
 
-    A node looks up values for the points alone that it moves: so all that could be in the head are moved, most to where they are.
+    A node looks up values only for points that it moves: so all that could be in the head are moved, most to where they are.
     """
     head = build.node("GeometryNodeObjectInfo", transform_space="RELATIVE")
     build.link(entry.outputs["Head"], head.inputs["Object"])

@@ -90,6 +90,23 @@ def scroll(blender, notches: int) -> None:
     blender.run("xdotool", "click", "--repeat", str(notches), "--delay", "12", "5")
 
 
+def watch(blender, module: str, cls: str) -> None:
+    """Count the operator's calls and note the longest; what drawing takes, in software here, is not in it."""
+    blender.ask(
+        "import sys, time\n"
+        f"cls = sys.modules['bl_ext.user_default.ct2hair.operators.{module}'].{cls}\n"
+        "modal = cls.modal\n"
+        "def timed(self, context, event):\n"
+        "    begun = time.perf_counter()\n"
+        "    outcome = modal(self, context, event)\n"
+        "    state['longest'] = max(state['longest'], time.perf_counter() - begun)\n"
+        "    state['calls'] = state['calls'] + 1\n"
+        "    return outcome\n"
+        "cls.modal = timed\n"
+        "state['longest'], state['calls'] = 0.0, 0"
+    )
+
+
 def test_the_zip_installs_and_the_tab_opens(blender):
     install = "bpy.ops.extensions.package_install_files"
     assert blender.ask(
@@ -146,20 +163,7 @@ def test_a_job_runs_beside_the_window_and_is_cancelled(blender):
         "    answer = list(bpy.ops.ct2hair.reconstruct('INVOKE_DEFAULT'))"
     )
     running = "import sys; current = sys.modules['bl_ext.user_default.ct2hair.operators.running'].current\n"
-    # what the job itself takes of the main loop; drawing, in software here, takes its own time
-    blender.ask(
-        "import sys, time\n"
-        "cls = sys.modules['bl_ext.user_default.ct2hair.operators.reconstruct'].CT2HAIR_OT_reconstruct\n"
-        "modal = cls.modal\n"
-        "def timed(self, context, event):\n"
-        "    begun = time.perf_counter()\n"
-        "    outcome = modal(self, context, event)\n"
-        "    state['longest'] = max(state['longest'], time.perf_counter() - begun)\n"
-        "    state['calls'] = state.get('calls', 0) + 1\n"
-        "    return outcome\n"
-        "cls.modal = timed\n"
-        "state['longest'] = 0.0"
-    )
+    watch(blender, "reconstruct", "CT2HAIR_OT_reconstruct")
     assert blender.ask(start) == ["RUNNING_MODAL"]
     time.sleep(3)
     seen, calls = set(), 0
@@ -215,3 +219,25 @@ def test_the_job_goes_on_to_hair(blender):
     for name, notches in (("7_result", 28), ("8_export", 80)):
         scroll(blender, notches)
         picture(blender, name)
+
+
+def test_the_simulation_runs_beside_the_window_and_is_cancelled(blender):
+    start = (
+        "window, area, _ = sidebar()\n"
+        "region = next(r for r in area.regions if r.type == 'WINDOW')\n"
+        "bpy.context.scene.frame_end = 200\n"
+        "with bpy.context.temp_override(window=window, area=area, region=region):\n"
+        "    answer = list(bpy.ops.ct2hair.simulate('INVOKE_DEFAULT'))"
+    )
+    watch(blender, "simulation", "CT2HAIR_OT_simulate")
+    assert blender.ask(start, timeout=60) == ["RUNNING_MODAL"]
+    blender.until("answer = bpy.context.scene.frame_current > 12", timeout=180)
+    blender.move(500, 500)
+    picture(blender, "9_simulation")
+    blender.key("Escape")
+    cancelled = time.monotonic()
+    blender.until("answer = bpy.context.scene.frame_current == 1 and 'CT2Hair Rest' not in bpy.data.objects", timeout=10)
+    assert time.monotonic() - cancelled < 3.0  # two seconds, and a moment to ask
+    held, calls = blender.ask("answer = [state['longest'], state['calls']]")
+    print(f"the running simulation held the window {1000 * held:.1f} ms at most in {calls} events")
+    assert calls > 20 and held < HELD
