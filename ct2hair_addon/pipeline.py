@@ -180,9 +180,14 @@ class _Job:
         wanted = dataclasses.replace(
             settings.refinement, prune=settings.refinement.prune and not settings.interpolation.strands
         )
+
+        def directions(progress: Progress):
+            # made again rather than kept: it is large, and quickly made
+            return orientation_field(density, level, settings.orientation, progress=progress).sample
+
         refined = self._stage(
             "refinement",
-            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress),
+            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress, field=directions),
         )
         tallies = {
             "scan": wig.tally,

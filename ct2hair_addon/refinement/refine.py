@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from .agreement import agreements
 from .boundary import Boundary
 from .curves import control_points, crowding, eased, easing_lengths, mean_curvature, polylines
 from .fit import fit_to_volume
+from .following import Field, along_field
 from .pruning import prune
 
 MISPLACED = 2.0
@@ -46,12 +48,14 @@ def refine(
     seed: int = 0,
     progress: Progress = silent,
     profile: StrandProfile | None = None,
+    field: Callable[[Progress], Field] | None = None,
 ) -> Refined:
     """Fit strands to the scan that they came from: roots stay where they are, lengths and curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
-    measured on the strands where not given. The same input and seed give the same bits on any number of threads. Raises
+    measured on the strands where not given. field: computes the scan's orientation field, which smooth hair is drawn along
+    before it is fitted; without it, it isn't. The same input and seed give the same bits on any number of threads. Raises
     Cancelled (by progress).
     """
     settings = settings or RefinementSettings()
@@ -66,16 +70,17 @@ def refine(
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     eases = settings.iterations and settings.method == "volume"
-    points, offsets = control_points(_eased(kept, density, profile) if eases else kept, settings.points)
-    first = (Strands(points, offsets), boundary.look(points))
+    first = part(progress, 0.05, 0.1)
+    points, offsets = control_points(_eased(kept, density, profile, settings, field, first) if eases else kept, settings.points)
+    before = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
         points, offsets, kept, counts = _pruned(
-            points, offsets, kept, density, profile, boundary, part(progress, 0.05, 0.1), MISPLACED
+            points, offsets, kept, density, profile, boundary, part(progress, 0.1, 0.15), MISPLACED
         )
         tally |= {f"{name}, before fitting": count for name, count in counts.items()}
     if settings.iterations and len(kept):
-        step = part(progress, 0.1, 0.85)
+        step = part(progress, 0.15, 0.85)
         points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, step)
         tally |= counts
         if judged:
@@ -90,8 +95,8 @@ def refine(
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
-    last = (Strands(points, offsets), boundary.look(points))
-    before, after = agreements([first, last], density, profile, progress=part(progress, 0.9, 0.98))
+    after = (Strands(points, offsets), boundary.look(points))
+    before, after = agreements([before, after], density, profile, progress=part(progress, 0.9, 0.98))
     fine, fine_offsets = polylines(points, offsets)
     fine[fine_offsets[:-1]] = kept.roots
     cleared, inside = boundary.clear(fine, fine_offsets)
@@ -101,12 +106,22 @@ def refine(
     return Refined(result, tally, {"before": before, "after": after})
 
 
-def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> Strands:
-    """The strands, points a voxel apart, without the noise of tracing."""
+def _eased(
+    strands: Strands,
+    density: BrickVolume,
+    profile: StrandProfile,
+    settings: RefinementSettings,
+    field: Callable[[Progress], Field] | None,
+    progress: Progress,
+) -> Strands:
+    """The strands, points a voxel apart, along the field and without the noise of tracing; curls as they were traced."""
     voxel = density.spacing
-    even = strands.resampled_by_step(voxel)
     crowded = crowding(strands, density, profile.peak)
     lengths = easing_lengths(mean_curvature(strands, voxel, crowded), voxel, crowded)
+    if field is not None and settings.follow and lengths.any():
+        reach = np.where(lengths > 0.0, crowded * settings.follow * voxel, 0.0)
+        strands = along_field(strands, reach, field(part(progress, 0.0, 0.7)), voxel, part(progress, 0.7, 1.0))
+    even = strands.resampled_by_step(voxel)
     points = eased(even.points, even.offsets, lengths, voxel, crowded)
     return Strands(points.astype(np.float32), even.offsets)
 
