@@ -28,9 +28,7 @@ CHUNK = 2000
 """Strands at a time: memory."""
 
 
-def along_field(
-    strands: Strands, lengths: np.ndarray, field: Field, voxel: float, progress: Progress = silent
-) -> Strands:
+def along_field(strands: Strands, lengths: np.ndarray, field: Field, voxel: float, progress: Progress = silent) -> Strands:
     """The strands, points a voxel apart, where |x - p|^2 + length^2 |x' - field|^2 is least along each; roots stay.
 
     strands: mm, scan frame. lengths (N,) mm, waves shorter than which give way to the field; 0 leaves a strand as it is.

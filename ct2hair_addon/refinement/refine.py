@@ -69,10 +69,11 @@ def refine(
     tally["pieces of lone strands measured"] = profile.pieces
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
-    eases = settings.iterations and settings.method == "volume"
-    first = part(progress, 0.05, 0.1)
-    points, offsets = control_points(_eased(kept, density, profile, settings, field, first) if eases else kept, settings.points)
-    before = (Strands(points, offsets), boundary.look(points))
+    start = kept
+    if settings.iterations and settings.method == "volume":
+        start = _eased(kept, density, profile, settings, field, part(progress, 0.05, 0.1))
+    points, offsets = control_points(start, settings.points)
+    given = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
         points, offsets, kept, counts = _pruned(
@@ -95,8 +96,8 @@ def refine(
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
-    after = (Strands(points, offsets), boundary.look(points))
-    before, after = agreements([before, after], density, profile, progress=part(progress, 0.9, 0.98))
+    fitted = (Strands(points, offsets), boundary.look(points))
+    before, after = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
     fine, fine_offsets = polylines(points, offsets)
     fine[fine_offsets[:-1]] = kept.roots
     cleared, inside = boundary.clear(fine, fine_offsets)
