@@ -164,7 +164,9 @@ def test_the_field_is_asked_once_and_for_smooth_hair_alone(head, profile):
         result = refine(given, render_density(truth, SPACING, BLUR), LEVEL, head, profile=profile, field=field)
         assert len(asked) == times, kind
         assert np.median(off(result.strands, truth)) < 0.25
-    refine(given, render_density(truth, SPACING, BLUR), LEVEL, head, RefinementSettings(follow=0.0), profile=profile, field=field)
+    refine(
+        given, render_density(truth, SPACING, BLUR), LEVEL, head, RefinementSettings(follow=0.0), profile=profile, field=field
+    )
     assert not asked
 
 
