@@ -44,15 +44,11 @@ class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):
         owner = context.scene
         cache = bpy.path.abspath(self.cache) if self.cache else None
         known = simulation_settings_of(owner.ct2hair.simulation)
-        self._frames = (owner.frame_start, owner.frame_end)
-        self._steps = scene.simulation_steps(scene.active_result(context), known, frames=self._frames, cache=cache)
-        self._share, work = next(self._steps)
+        result, frames = scene.active_result(context), (owner.frame_start, owner.frame_end)
         if headless():
-            while True:
-                try:
-                    self._share, work = self._steps.send(work())
-                except StopIteration as end:
-                    return self._say(end.value)
+            return self._say(scene.simulate(result, known, frames=frames, cache=cache))
+        self._steps = scene.simulation_steps(result, known, frames=frames, cache=cache)
+        self._share, work = next(self._steps)
         self._begun, self._stopping = time.monotonic(), False
         self._threads = ThreadPoolExecutor(1)
         self._work = self._threads.submit(work)
@@ -71,7 +67,11 @@ class CT2HAIR_OT_simulate(OfResult, bpy.types.Operator):
         if self._stopping:
             self.report({"WARNING"}, "Simulation cancelled: the hair is as it was")
             return self._leave(context, {"CANCELLED"})
-        outcome = self._go_on(context)
+        try:
+            outcome = self._go_on(context)
+        except BaseException:  # a fault of ours leaves no timer and no half-done simulation either
+            self._leave(context, {"CANCELLED"})
+            raise
         return outcome if outcome == {"RUNNING_MODAL"} else self._leave(context, outcome)
 
     @reported(CT2HairError, OSError)

@@ -129,10 +129,11 @@ def simulation_steps(
         _set_following(result, shown)
     motion = np.stack([moved for _, moved in samples])
     rest = guides.points.reshape(-1, settings.points, 3)
-    _write_pc2(cache, motion.reshape(len(motion), -1, 3) * MM, first)
     tip = float(np.linalg.norm(motion[-1].reshape(rest.shape)[:, -1] - rest[:, -1], axis=1).mean())
     hair = {ob: strands_of(ob) for ob in (result.hair, result.guides) if ob is not None}
     following = yield 0.95, lambda: [_followed(strands, guides, settings.points, obstacle) for strands in hair.values()]
+    # the last step is behind: from here on nothing can leave a new file with the old simulation
+    _write_pc2(cache, motion.reshape(len(motion), -1, 3) * MM, first)
     with NewData() as new:
         playing = _new_motion(new, result, guides, cache, first)
         group = _follow_group(new)

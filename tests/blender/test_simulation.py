@@ -133,14 +133,10 @@ def modal(extension, result, tmp_path, monkeypatch):
         setattr(operator, name, MethodType(getattr(cls, name), operator))
 
     def step(kind, value="NOTHING"):
-        begun = time.perf_counter()
-        outcome = cls.modal(operator, context, SimpleNamespace(type=kind, value=value))
-        held.append(time.perf_counter() - begun)
-        return outcome
+        return cls.modal(operator, context, SimpleNamespace(type=kind, value=value))
 
-    held: list[float] = []
     start = lambda: cls.execute(operator, context)  # noqa: E731
-    return SimpleNamespace(start=start, step=step, context=context, reports=reports, held=held, operator=operator, cls=cls)
+    return SimpleNamespace(start=start, step=step, context=context, reports=reports, operator=operator, cls=cls, module=module)
 
 
 def through(modal) -> set[str]:
@@ -174,6 +170,31 @@ def test_escape_leaves_all_as_it_was(modal, result, tmp_path):
     assert block_counts() == before and not modal.context.timers and scene.simulated_frames(result) is None
     assert bpy.context.scene.frame_current == 1 and not list(tmp_path.iterdir())
     assert modal.reports[-1][0] == "WARNING"
+
+
+def test_escape_at_the_very_end_leaves_the_simulation_before_and_its_file(modal, result, tmp_path):
+    scene.simulate(result, SimulationSettings(wind_y=5.0), frames=(1, 3), cache=tmp_path / "motion.pc2")
+    before = block_counts(), (tmp_path / "motion.pc2").read_bytes()
+    modal.start()
+    while modal.operator._share < 0.95:
+        assert modal.step("TIMER") == {"RUNNING_MODAL"}
+        time.sleep(0.002)
+    modal.step("ESC", "PRESS")
+    assert through(modal) == {"CANCELLED"}
+    assert (block_counts(), (tmp_path / "motion.pc2").read_bytes()) == before
+    assert scene.simulated_frames(result) == (1, 3)
+
+
+def test_a_fault_in_a_step_leaves_all_as_it_was(modal, result, tmp_path, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("a fault of ours")
+
+    before = block_counts()
+    monkeypatch.setattr(modal.module.scene.simulation.Simulation, "step", broken)
+    modal.start()
+    with pytest.raises(ZeroDivisionError):
+        through(modal)
+    assert block_counts() == before and not modal.context.timers and not list(tmp_path.iterdir())
 
 
 def test_closing_the_window_ends_it(modal, result):
