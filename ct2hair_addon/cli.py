@@ -17,7 +17,7 @@ import sys
 import time
 import traceback
 from argparse import SUPPRESS, BooleanOptionalAction
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
@@ -128,6 +128,11 @@ def add_parameter(parser, option: str, dest: str, known: Field, default: str = "
         choices = known.metadata["choices"] or None
         name = None if choices else option.lstrip("-").split("-")[-1].upper()
         parser.add_argument(option, type=_TYPES[known.type], choices=choices, metavar=name, **common)
+
+
+def given(chosen: argparse.Namespace, names: Container[str]) -> dict[str, Any]:
+    """What was given of the options that `add_parameter` made with these `dest` names."""
+    return {name: value for name, value in vars(chosen).items() if name in names}
 
 
 def _add_inspect(commands) -> None:
@@ -266,8 +271,7 @@ def _reconstruct(chosen: argparse.Namespace) -> int:
     settings = Settings.preset(chosen.preset)
     if chosen.settings:
         settings = settings.changed(_settings_file(chosen.settings))
-    known = dict(parameters())
-    settings = settings.changed({name: value for name, value in vars(chosen).items() if name in known})
+    settings = settings.changed(given(chosen, dict(parameters())))
     from . import pipeline  # late: it loads numba and torch
 
     result = pipeline.reconstruct(
@@ -358,8 +362,7 @@ def _synthesize(chosen: argparse.Namespace) -> int:
     from .head import load_obj, mark_scalp, template_head
     from .strand_files import read_strands
 
-    known = {field.name for field in fields(SynthesisSettings)}
-    settings = SynthesisSettings().changed({name: value for name, value in vars(chosen).items() if name in known})
+    settings = SynthesisSettings().changed(given(chosen, [known.name for known in fields(SynthesisSettings)]))
     if chosen.hair in STYLES:
         head = load_obj(chosen.head) if chosen.head else template_head()
         strands = hairstyle(chosen.hair, head, chosen.strands, settings.seed)

@@ -10,7 +10,7 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-from .cli import DONE, TerminalObserver, add_command, add_parameter
+from .cli import DONE, TerminalObserver, add_command, add_parameter, given
 from .errors import CT2HairError
 from .settings import SimulationSettings
 
@@ -97,8 +97,7 @@ def _groom(chosen: argparse.Namespace) -> int:
         raise CT2HairError(
             f"groom works in Blender: run `blender --command ct2hair groom ...`, or pip install bpy for {sys.executable}"
         ) from None
-    known = {field.name for field in fields(SimulationSettings)}
-    motion = SimulationSettings().changed({name: value for name, value in vars(chosen).items() if name in known})
+    motion = SimulationSettings().changed(given(chosen, [known.name for known in fields(SimulationSettings)]))
     _check(scene, chosen)
 
     frames = tuple(chosen.simulate) if chosen.simulate else None

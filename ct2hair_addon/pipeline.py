@@ -180,14 +180,19 @@ class _Job:
         wanted = dataclasses.replace(
             settings.refinement, prune=settings.refinement.prune and not settings.interpolation.strands
         )
-
-        def directions(progress: Progress):
-            # made again rather than kept: it is large, and quickly made
-            return orientation_field(density, level, settings.orientation, progress=progress).sample
-
         refined = self._stage(
             "refinement",
-            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress, field=directions),
+            lambda progress: refine(
+                dense.strands,
+                density,
+                level,
+                head,
+                wanted,
+                seed,
+                progress=progress,
+                # made again rather than kept: it is large, and quickly made
+                field=lambda progress: self._orientation(density, level, progress).sample,
+            ),
         )
         tallies = {
             "scan": wig.tally,
@@ -226,6 +231,9 @@ class _Job:
         save_vdb(wig.density, self.out / "volume.vdb")
         return wig
 
+    def _orientation(self, density: BrickVolume, level: float, progress: Progress) -> OrientationField:
+        return orientation_field(density, level, self.settings.orientation, progress=progress)
+
     def _guides(self, density: BrickVolume, level: float, head: Head, knots: np.ndarray) -> Guides:
         """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
         guides = self.checkpoints.load("guides", self.keys["guides"])
@@ -234,7 +242,7 @@ class _Job:
             fields = [
                 self._stage(
                     "orientation",
-                    lambda progress: orientation_field(density, level, self.settings.orientation, progress=progress),
+                    lambda progress: self._orientation(density, level, progress),
                 )
             ]
         guides = self._stage(

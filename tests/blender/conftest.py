@@ -16,7 +16,7 @@ import pytest
 from ct2hair_addon.cache import cache_folder
 from ct2hair_addon.head import HeadMesh
 from ct2hair_addon.strands import Strands
-from ct2hair_addon.volume import BrickVolume, save_vdb
+from ct2hair_addon.volume import BrickVolume, Inspection, Thresholds, save_vdb
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "ct2hair_extension"
@@ -174,3 +174,13 @@ class Window:
 
     def status_text_set(self, text):
         self.status = text
+
+
+@pytest.fixture
+def inspection():
+    rng = np.random.default_rng(0)
+    look = rng.normal(1000, 30, (30, 40, 50)).astype(np.float32)
+    look[5:9, 30:34, 40:44] = 1400  # an asymmetric lump of hair
+    counts, edges = np.histogram(look, 256)
+    found = Thresholds(1000.0, 30.0, 130.0, 1200.0, 1600.0, None, 500)
+    return Inspection(counts, edges, look, (60, 80, 100), (0.5, 0.5, 0.5), 2_000_000, found)

@@ -15,7 +15,7 @@ from ct2hair_addon.errors import CT2HairError
 from ct2hair_addon.settings import ScanSettings, Settings
 from ct2hair_addon.strand_files import read_strands
 from ct2hair_addon.strands import Strands
-from ct2hair_addon.volume import Inspection, Thresholds
+from ct2hair_addon.volume import Inspection
 
 from .conftest import block_counts, strands_on
 
@@ -227,16 +227,6 @@ def test_landmarks_that_are_dragged_move_the_head(job_folder):
 
 
 # --- looking
-
-
-@pytest.fixture
-def inspection():
-    rng = np.random.default_rng(0)
-    look = rng.normal(1000, 30, (30, 40, 50)).astype(np.float32)
-    look[5:9, 30:34, 40:44] = 1400  # an asymmetric lump of hair
-    counts, edges = np.histogram(look, 256)
-    found = Thresholds(1000.0, 30.0, 130.0, 1200.0, 1600.0, None, 500)
-    return Inspection(counts, edges, look, (60, 80, 100), (0.5, 0.5, 0.5), 2_000_000, found)
 
 
 def test_a_look_comes_back_from_its_file(inspection, tmp_path):

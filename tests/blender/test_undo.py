@@ -11,7 +11,6 @@ import pytest
 from ct2hair_addon import scene
 
 from .conftest import block_counts
-from .test_artist import inspection  # noqa: F401  (a fixture)
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -97,7 +96,7 @@ def with_short_timeline(folder, **_):
     bpy.context.scene.frame_end = 2
 
 
-def with_look(folder, extension, inspection):  # noqa: F811
+def with_look(folder, extension, inspection):
     with_scan(folder)
     pictures = extension.operators.look._pictures
     pictures.inspection, pictures.scan = inspection, bpy.context.scene.ct2hair.scan
@@ -154,7 +153,7 @@ def test_no_operator_is_left_out():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_can_be_undone(name, job_folder, extension, inspection):  # noqa: F811
+def test_it_can_be_undone(name, job_folder, extension, inspection):
     prepare, arguments = CASES[name]
     prepare(job_folder, extension=extension, inspection=inspection)
     owner = bpy.context.scene.ct2hair
