@@ -113,7 +113,8 @@ def reconstruct(
 
     raw_shape (x, y, z) and raw_type (a numpy type, "<u2" say) describe a raw file. template: a head mesh in the head frame
     instead of `settings.head.mesh`. until: one of `STOPS`: stop after that stage, write what there is by then (volume.vdb,
-    head.obj, guides.npz, dense.npz) with stage.json, and return None. Raises CT2HairError (bad input, said in a sentence)
+    head.obj, orientation.vdb with lines to look at in orientation.npz, guides.npz, dense.npz) with stage.json, and return
+    None. Raises CT2HairError (bad input, said in a sentence)
     and Cancelled (by the observer).
     """
     settings = settings or Settings()
@@ -162,6 +163,10 @@ class _Job:
         wig = dataclasses.replace(wig, density=density)  # the net's voxels are needed no more
         if self.until == "head":
             return self._stop(wig, registration)
+        if self.until == "orientation":
+            field = self._stage("orientation", lambda progress: self._orientation(density, level, progress))
+            field.save(self.out / "orientation.vdb")
+            return self._stop(wig, registration, orientation=field.lines())
         guides = self._guides(density, level, head, wig.knots)
         if self.until == "guides":
             return self._stop(wig, registration, guides=guides.strands)

@@ -14,7 +14,7 @@ from typing import Any
 
 from .errors import SettingsError
 
-STOPS = ("scan", "head", "guides", "dense")
+STOPS = ("scan", "head", "orientation", "guides", "dense")
 """Stages of the pipeline that a reconstruction may stop after, to be looked at; without, it goes through."""
 AXES = ("auto", "+x", "-x", "+y", "-y", "+z", "-z")
 

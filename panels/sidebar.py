@@ -228,7 +228,7 @@ class CT2HAIR_PT_stages(_Sidebar, bpy.types.Panel):
         for stage, label in STAGE_NAMES.items():
             row = column.row()
             row.label(text=label, icon=STATES[current.stages.get(stage, "")])
-            if stage not in ("orientation", "refinement"):
+            if stage != "refinement":
                 row.operator("ct2hair.reconstruct", text="Run up to here", icon="PLAY").until = stage
 
 

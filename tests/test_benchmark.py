@@ -12,7 +12,6 @@ from ct2hair_addon.benchmark.peers import fullest_cube
 from ct2hair_addon.benchmark.sets import _flags, methods
 from ct2hair_addon.benchmark.tables import PRINTED, Table, shown
 from ct2hair_addon.errors import SettingsError
-from ct2hair_addon.orientation import OrientationField
 from ct2hair_addon.volume import BrickVolume
 
 
@@ -71,17 +70,6 @@ def test_what_was_measured_is_kept_until_something_changes(tmp_path, monkeypatch
     monkeypatch.setattr(runner, "sources", lambda: "other code")
     assert bench.kept("a", {"x": 1}, work) == {"value": 3}
     assert not list(tmp_path.rglob("*.part"))
-
-
-def test_oriented_voxels_lie_where_the_field_has_them():
-    direction, sure = np.zeros((32, 16, 16, 3), np.int8), np.zeros((32, 16, 16), np.uint8)
-    sure[20, 3, 5], direction[20, 3, 5] = 9, (0, 127, 0)
-    bricks = BrickVolume.from_dense(sure, 0.5, (1.0, 2.0, 3.0))
-    turned = direction.reshape(2, 16, 16, 16, 3)[1:]
-    field = OrientationField(BrickVolume(bricks.table, turned, 0.5, bricks.origin), bricks, {})
-    points, directions = runner.oriented_voxels(field)
-    np.testing.assert_allclose(points, [[11.0, 3.5, 5.5]])
-    np.testing.assert_array_equal(directions, [[0, 127, 0]])
 
 
 def test_the_fullest_cube_holds_the_most_hair():

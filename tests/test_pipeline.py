@@ -14,7 +14,8 @@ from ct2hair_addon.errors import Cancelled, CT2HairError, ScanError
 from ct2hair_addon.evaluation import evaluate, hairstyle, synthesize
 from ct2hair_addon.head import Head, load_obj, template_head
 from ct2hair_addon.jobs import start
-from ct2hair_addon.settings import Settings
+from ct2hair_addon.orientation.field import LINES
+from ct2hair_addon.settings import STOPS, Settings
 from ct2hair_addon.strands import Strands
 
 SPACING = 0.9
@@ -104,6 +105,30 @@ def test_a_cancelled_run_keeps_its_finished_stages(result, scan, tmp_path):
         pipeline.reconstruct(scan, tmp_path / "out", SETTINGS, observer=Impatient())
     assert sorted(p.name for p in (tmp_path / "out" / "checkpoints").iterdir()) == ["head.npz", "orientation.npz", "scan.npz"]
     assert not (tmp_path / "out" / "hair.npz").exists()
+
+
+def test_stopped_after_each_stage_it_shows_what_there_is_and_ends_as_if_it_had_not(result, scan, tmp_path):
+    out = tmp_path / "out"
+    more = {
+        "scan": {"volume.vdb"},
+        "head": {"head.obj"},
+        "orientation": {"orientation.vdb", "orientation.npz"},
+        "guides": {"guides.npz"},
+        "dense": {"dense.npz"},
+    }
+    assert tuple(more) == STOPS
+    there = {"checkpoints", "stage.json"}
+    for stage, files in more.items():
+        assert pipeline.reconstruct(scan, out, SETTINGS, until=stage) is None
+        there |= files
+        assert {path.name for path in out.iterdir()} - {".running"} == there
+        assert json.loads((out / "stage.json").read_text(encoding="utf-8"))["until"] == stage
+    lines = Strands.load(out / "orientation.npz")
+    assert len(lines) == LINES and set(lines.counts) == {2}
+    pipeline.reconstruct(scan, out, SETTINGS)
+    assert (out / "hair.npz").read_bytes() == (result[0] / "hair.npz").read_bytes()
+    with pytest.raises(CT2HairError, match="unknown stage 'end'"):
+        pipeline.reconstruct(scan, out, SETTINGS, until="end")
 
 
 def test_a_scan_that_is_not_there_leaves_nothing(tmp_path):

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
 
 from ..evaluation import (
     centre_line_error,
@@ -31,11 +30,11 @@ from ..evaluation import (
 )
 from ..head import Head, HeadMesh, load_obj, remove_hairnet, template_head
 from ..measure import Meter, machine_memory
-from ..orientation import OrientationField, orientation_field
+from ..orientation import orientation_field
 from ..pipeline import Silent, reconstruct
 from ..settings import Settings
 from ..strands import Strands
-from ..volume import BRICK, BrickVolume, load_vdb
+from ..volume import BrickVolume, load_vdb
 
 VOXELS = (1.25, 2.5)
 """Voxels of the voxel scores in units of the scan's (EVALUATION.md)."""
@@ -173,23 +172,13 @@ def orientation_scores(density: BrickVolume, level: float, settings: Settings, t
     meter = Meter()
     field = orientation_field(density, level, settings.orientation)
     seconds = meter.seconds
-    points, directions = oriented_voxels(field)
+    points, directions, _ = field.voxels(ORIENTED)
     return {
         **orientation_error(points, directions, truth),
         "seconds": seconds,
         "hair_voxels": field.tally["hair voxels"],
         "peak_memory": meter.peak_memory,
     }
-
-
-def oriented_voxels(field: OrientationField, most: int = ORIENTED) -> tuple[np.ndarray, np.ndarray]:
-    """((M, 3) mm, (M, 3) int8) places and directions of at most `most` voxels of the field, drawn with a fixed seed."""
-    rows, i, j, k = np.nonzero(field.confidence.bricks)
-    if len(rows) > most:
-        drawn = np.sort(np.random.default_rng(0).permutation(len(rows))[:most])
-        rows, i, j, k = rows[drawn], i[drawn], j[drawn], k[drawn]
-    voxels = BRICK * field.direction.brick_index[rows].astype(np.int64) + np.stack([i, j, k], axis=1)
-    return field.direction.to_scan(voxels), field.direction.bricks[rows, i, j, k]
 
 
 def machine() -> dict[str, Any]:

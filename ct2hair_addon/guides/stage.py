@@ -13,6 +13,7 @@ from ..settings import GuideSettings
 from ..strands import Strands
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile
+from .course import hair_course
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
 from .linking import cut_segments, link_segments, meeting_ends
@@ -51,15 +52,21 @@ class Guides:
 def find_segments(
     density: BrickVolume,
     hair_level: float,
+    course: BrickVolume,
     seeds: Seeds,
     settings: GuideSettings,
     progress: Progress = silent,
 ) -> tuple[Strands, StrandProfile, dict[str, int]]:
-    """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing."""
+    """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing.
+
+    course: which way hair goes, in the density's bricks (`hair_course`).
+    """
     profile = _profile(density, hair_level, seeds)
     order = seed_order(density, *seeds, profile, part(progress, 0.0, 0.15))
     residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
-    found = trace_segments(residual, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.15, 1.0))
+    found = trace_segments(
+        residual, course, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.15, 1.0)
+    )
     return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
 
 
@@ -93,9 +100,10 @@ def trace_guides(
     if settings.method == "paper":
         strands, tally = paper_guides(density, field.direction, field.confidence, head, settings, seed, progress)
         return Guides(strands, _profile(density, hair_level, seeds), tally)
+    way = hair_course(field.direction, field.confidence)
     del field  # as large as the density in float32: its memory is free from here on if the caller, too, has let go of it
-    segments, profile, tally = find_segments(density, hair_level, seeds, settings, part(progress, 0.0, 0.85))
-    del seeds
+    segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85))
+    del seeds, way
     strands, more = root_segments(
         segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen, knots=knots
     )

@@ -18,6 +18,7 @@ from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, add_strand
+from .course import course_at
 from .sampling import centred, density_at, line_mean, plane
 
 MOST_STEPS = 3000
@@ -34,6 +35,12 @@ BEND_SPAN = 8
 """Steps between the three points of a path that its bend is taken from."""
 LEAST_BEND = 0.02
 """1/voxel; less is noise: a bend of this size and below is not looked ahead along."""
+OFF_COURSE = 4.0
+"""Share of a strand's density that a step square to the hair's course must win to be taken, where the course is sure."""
+OTHER_HAIR = 0.8
+"""Cosine to the course below which it is that of other hair."""
+DRAWN = 0.08
+"""Share of a step by which a path is drawn to the density's ridge with each: more, and it is drawn over to a neighbour."""
 SUPPORT = 0.4
 """Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
 SHARPNESS = 0.06
@@ -75,7 +82,7 @@ WEIGHTS = np.linspace(1.0, 0.4, LOOK)
 
 
 @numba.njit(cache=True, nogil=True)
-def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
+def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
     """Follow one way from (x, y, z) along d into `path` (n, 3) voxels; returns (points, reason)."""
     whole = weights.sum()
     count = 0
@@ -96,6 +103,8 @@ def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, 
             scale = max(1.0 - noise / max(bx * bx + by * by + bz * bz, 1e-12), 0.0) / (BEND_SPAN * step) ** 2
             bx, by, bz = scale * bx, scale * by, scale * bz
         best, chosen, backed = -1e30, 0, 0.0
+        cx, cy, cz, trust = course_at(table, course, x, y, z)
+        off = OFF_COURSE * trust if abs(cx * dx + cy * dy + cz * dz) > OTHER_HAIR else 0.0
         for n in range(len(fan)):
             a, b = fan[n, 0], fan[n, 1]
             ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
@@ -109,7 +118,7 @@ def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, 
                 value = density_at(table, bricks, px, py, pz) / seen
                 total += weights[k] * min(value, 1.3)
             total /= whole
-            scores[n] = total - TURN_COST * (square - 1.0)
+            scores[n] = total - TURN_COST * (square - 1.0) - off * (1.0 - (ex * cx + ey * cy + ez * cz) ** 2)
             if scores[n] > best:
                 best, chosen, backed = scores[n], n, total
         if backed < SUPPORT:
@@ -134,7 +143,7 @@ def _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, 
         ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
-        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, 0.3 * step)
+        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, DRAWN * step)
         # Inertia: the new direction leans on the last few steps' secant.
         if count >= 4:
             sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]
@@ -219,7 +228,9 @@ def _alive(table, bricks, voxels, directions, level):
 
 
 @numba.njit(cache=True, parallel=True)
-def _trace(table, bricks, voxels, directions, step, turn, seen, fan, weights, widths, most, paths, firsts, counts, ends):
+def _trace(
+    table, bricks, course, voxels, directions, step, turn, seen, fan, weights, widths, most, paths, firsts, counts, ends
+):
     """Follow each seed both ways; `paths[n, firsts[n]:firsts[n] + counts[n, 0] + counts[n, 1] + 1]` is its smoothed path."""
     for n in numba.prange(len(voxels)):
         dx, dy, dz = float(directions[n, 0]), float(directions[n, 1]), float(directions[n, 2])
@@ -229,7 +240,9 @@ def _trace(table, bricks, voxels, directions, step, turn, seen, fan, weights, wi
         for _ in range(2):
             x, y, z, _value = centred(table, bricks, x, y, z, dx, dy, dz, 3, 0.7)
         middle = paths.shape[1] // 2
-        ahead, reason = _follow(table, bricks, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, paths[n, middle + 1 :])
+        ahead, reason = _follow(
+            table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, paths[n, middle + 1 :]
+        )
         ends[n, 1] = reason
         # The way back sets out along the first steps' own direction, surer than the field's.
         if ahead >= 4:
@@ -237,7 +250,7 @@ def _trace(table, bricks, voxels, directions, step, turn, seen, fan, weights, wi
             norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
             dx, dy, dz = sx * norm, sy * norm, sz * norm
         back_path = np.empty((middle, 3), np.float32)
-        back, reason = _follow(table, bricks, x, y, z, -dx, -dy, -dz, step, turn, seen, fan, weights, back_path)
+        back, reason = _follow(table, bricks, course, x, y, z, -dx, -dy, -dz, step, turn, seen, fan, weights, back_path)
         ends[n, 0] = reason
         paths[n, middle, 0], paths[n, middle, 1], paths[n, middle, 2] = x, y, z
         for m in range(back):
@@ -304,6 +317,7 @@ class Segments:
 
 def trace_segments(
     residual: BrickVolume,
+    course: BrickVolume,
     voxels: np.ndarray,
     directions: np.ndarray,
     order: np.ndarray,
@@ -313,7 +327,8 @@ def trace_segments(
 ) -> Segments:
     """Trace and subtract from the seeds in their order until none is left. `residual.bricks` is used up: pass a copy.
 
-    voxels, directions: (S, 3) seeds; order: indices into them. The result is the same on any number of threads.
+    course: which way hair goes, in the same bricks (`hair_course`). voxels, directions: (S, 3) seeds; order: indices into
+    them. The result is the same on any number of threads.
     """
     shortest = max(int(settings.min_length / (settings.step * residual.spacing)), 6)
     turn = np.cos(np.radians(settings.max_turn))
@@ -338,8 +353,8 @@ def trace_segments(
         counts = np.zeros((len(chosen), 2), np.int64)
         ends = np.zeros((len(chosen), 2), np.int64)
         _trace(
-            residual.table, residual.bricks, voxels[chosen], directions[chosen], settings.step, turn, profile.seen, FAN,
-            WEIGHTS, widths, settings.smoothing, paths, firsts, counts, ends,
+            residual.table, residual.bricks, course.bricks, voxels[chosen], directions[chosen], settings.step, turn,
+            profile.seen, FAN, WEIGHTS, widths, settings.smoothing, paths, firsts, counts, ends,
         )  # fmt: skip
         _settle(
             residual.table, residual.bricks, paths, firsts, counts, ends, profile.seen, profile.peak, profile.blur, shortest, 0,

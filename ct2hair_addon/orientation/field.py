@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numba
@@ -9,6 +10,8 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..settings import OrientationSettings
+from ..strands import Strands
+from ..volume import as_grid, write_grids
 from ..volume.grid import BRICK, BrickVolume, gather
 from .eigen import smallest_eigenvector
 from .filters import box_taps, derivative_taps, gaussian_taps, gradients, noise_gain, tensor
@@ -20,6 +23,8 @@ STRAND_BLUR = 0.85
 """voxel; how wide a strand lies in a scan (EVALUATION.md). Smoothing lowers its peak by STRAND_BLUR^2 / (STRAND_BLUR^2 +
 sigma^2),
 and the hair level with it, so that a lone strand stays hair whatever `sigma` is."""
+LINES = 200_000
+"""Lines that show a field, unless it is said how many."""
 UNIT = 127.0
 """A direction's unit length as stored in int8."""
 
@@ -48,6 +53,36 @@ class OrientationField:
         direction, confidence = _nearest(self.direction.table, self.direction.bricks, self.confidence.bricks, voxels)
         norm = np.linalg.norm(direction, axis=1, keepdims=True)
         return direction / np.where(norm > 0, norm, 1.0).astype(np.float32), confidence
+
+    def voxels(self, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(M, 3) mm, (M, 3) unit float32, (M,) 0 to 1: place, direction and confidence of at most `most` voxels, drawn with a
+        fixed seed."""
+        held = np.flatnonzero(self.confidence.bricks)
+        if len(held) > most:
+            held = held[np.sort(np.random.default_rng(0).choice(len(held), most, replace=False, shuffle=False))]
+        row, *at = np.unravel_index(held, self.confidence.bricks.shape)
+        places = self.direction.to_scan(BRICK * self.direction.brick_index[row].astype(np.int64) + np.stack(at, axis=1))
+        directions = self.direction.bricks[row, *at].astype(np.float32)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        return places, directions, self.confidence.bricks[row, *at] / np.float32(255.0)
+
+    def lines(self, most: int = LINES) -> Strands:
+        """The field to look at: lines of two points, one voxel long, mm, at at most `most` voxels; with the strand
+        attribute `confidence` (N,)."""
+        places, directions, confidence = self.voxels(most)
+        half = (0.5 * self.direction.spacing) * directions
+        points = np.stack([places - half, places + half], axis=1).reshape(-1, 3).astype(np.float32)
+        offsets = np.arange(0, len(points) + 1, 2, dtype=np.int64)
+        return Strands(points, offsets, {"confidence": confidence})
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write both as grids of a .vdb, `orientation` (vectors of about unit length) and `confidence` (0 to 1), active at hair
+        voxels, placed in the scan frame (mm). Raises ScanError where the file can't be written."""
+        grids = [
+            as_grid(self.direction, "orientation", 1.0 / UNIT),
+            as_grid(self.confidence, "confidence", 1.0 / 255.0),
+        ]
+        write_grids(path, grids)
 
 
 def noise_level(density: BrickVolume) -> float:

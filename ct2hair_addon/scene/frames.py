@@ -8,6 +8,7 @@ The layout of a result, in the collection 'CT2Hair <name>'::
             <name> Guides   curves, the same frame, not rendered
         <name> Scan         empty whose matrix is scan -> head -> scene: the scan's rotation, its shift and mm -> m
             <name> Volume   the OpenVDB grid, whose own transform is in mm of the scan frame
+        <name> Lines        curves, the head frame in metres: the orientation field, after that stage alone
 
 No object but the scan's empty has a scale, so head and hair hold true metres in their data. A registration may have scaled the
 template to the wearer: that scale is the head's size, not the scene's, and is left out of `scene_from_scan`.

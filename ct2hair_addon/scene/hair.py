@@ -127,6 +127,29 @@ def new_hair(
     return NewHair(ob, tally)
 
 
+def new_lines(
+    new: NewData, name: str, lines: Strands, *, material: bpy.types.Material | None = None, diameter: float = 4 * DIAMETER
+) -> bpy.types.Object:
+    """A Curves object of straight `lines` (mm, two points each) as they are, on nothing, not linked yet.
+
+    With every attribute of theirs and `direction` (CURVE), along which each runs. diameter: mm.
+    """
+    if not len(lines):
+        raise StrandFileError(f"'{name}' has no line: there is nothing to show")
+    curves = new.add(bpy.data.hair_curves.new(name))
+    curves.add_curves(lines.counts.tolist())
+    curves.set_types(type="POLY")
+    curves.position_data.foreach_set("vector", (lines.points * np.float32(MM)).ravel())
+    write_attribute(curves, "radius", "FLOAT", "POINT", np.full(len(lines.points), 0.5 * MM * diameter))
+    along = lines.points[1::2] - lines.points[::2]
+    directions = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    for key, values in {**lines.strand_attributes, "direction": directions}.items():
+        _write_array(curves, key, "CURVE", np.asarray(values))
+    if material is not None:
+        curves.materials.append(material)
+    return new.add(bpy.data.objects.new(name, curves))
+
+
 def strands_of(ob: bpy.types.Object, evaluated: bool = False) -> Strands:
     """The Strands (mm, in the object's own frame) of a hair curves object, with its attributes.
 

@@ -180,6 +180,24 @@ def support_material(new: NewData, name: str) -> bpy.types.Material:
     return material
 
 
+def orientation_material(new: NewData, name: str) -> bpy.types.Material:
+    """Lines coloured by which way they run (attribute `direction`): red along x, green along y, blue along z."""
+    material = _material(new, name)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    out = nodes.new("ShaderNodeOutputMaterial")
+    glow = nodes.new("ShaderNodeEmission")  # as it is, in any light
+    size = nodes.new("ShaderNodeVectorMath")
+    size.operation = "ABSOLUTE"
+    attribute = nodes.new("ShaderNodeAttribute")
+    attribute.attribute_name = "direction"
+    links.new(attribute.outputs["Vector"], size.inputs[0])
+    links.new(size.outputs["Vector"], glow.inputs["Color"])
+    links.new(glow.outputs["Emission"], out.inputs["Surface"])
+    _place(nodes, [attribute], [size], [glow], [out])
+    return material
+
+
 def guide_material(new: NewData, name: str) -> bpy.types.Material:
     """A plain bright material that tells guides from hair."""
     material = _material(new, name)

@@ -33,9 +33,9 @@ from ..strand_files import read_strands
 from ..strands import Strands
 from .export import write_alembic, write_blend, write_strand_file, write_usd
 from .frames import MM, head_from_scan, scene_from_scan, scene_from_unregistered_scan
-from .hair import DIAMETER, new_hair
+from .hair import DIAMETER, new_hair, new_lines
 from .head import attach, head_mesh, new_head, save_head
-from .materials import guide_material, hair_material
+from .materials import guide_material, hair_material, orientation_material
 from .picture import render_picture
 from .results import KIND, ROLE, HairResult, ScanResult
 from .staging import NewData
@@ -296,8 +296,9 @@ def load_stage(folder: str | Path, *, colour: str = "brown", context: bpy.types.
         return _show_wig(folder / "volume.vdb", name, level, properties, context)
     to_head = head_from_scan(matrix)
     mesh = load_obj(folder / "head.obj").transformed(to_head)
-    if until == "head":
-        return _show_wig(folder / "volume.vdb", name, level, properties, context, mesh, matrix)
+    if until in ("head", "orientation"):
+        lines = Strands.load(folder / "orientation.npz").transformed(to_head) if until == "orientation" else None
+        return _show_wig(folder / "volume.vdb", name, level, properties, context, mesh, matrix, lines)
     guides = Strands.load(folder / "guides.npz").transformed(to_head)
     hair = Strands.load(folder / "dense.npz").transformed(to_head) if until == "dense" else guides
     return show_strands(
@@ -314,8 +315,9 @@ def load_stage(folder: str | Path, *, colour: str = "brown", context: bpy.types.
     ).collection
 
 
-def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=None) -> bpy.types.Collection:
-    """The wig's volume, and the head in it where it is known, as a collection of the kind `scan`."""
+def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=None, orientation=None) -> bpy.types.Collection:
+    """The wig's volume, the head in it and its hair's orientation (lines, mm, head frame) where they are known, as a collection
+    of the kind `scan`."""
     summary = summarize(grid, level)
     with NewData() as new:
         collection, root = _new_collection(new, name, "scan")
@@ -327,12 +329,20 @@ def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=No
         )
         scan.matrix_basis = Matrix(place.tolist())
         collection.objects.link(scan)
-        _enrol(collection, new_volume(new, f"{name} Volume", grid, summary), "volume", scan)
+        volume = new_volume(new, f"{name} Volume", grid, summary)
+        _enrol(collection, volume, "volume", scan)
         if mesh is not None:
             _enrol(collection, new_head(new, f"{name} Head", mesh), "head", root)
+        if orientation is not None:
+            material = orientation_material(new, f"{name} Lines")
+            lines = new_lines(new, f"{name} Lines", orientation, material=material, diameter=0.2 * summary.spacing)
+            _enrol(collection, lines, "orientation", root)
+            volume.hide_render = True  # the lines stand where the cloud does
         for key, value in properties.items():
             collection[key] = value
-    _link(collection, context)
+    view_layer = _link(collection, context)
+    if orientation is not None and volume.name in view_layer.objects:
+        volume.hide_set(True, view_layer=view_layer)
     return collection
 
 

@@ -21,16 +21,27 @@ def save_vdb(volume: BrickVolume, path: str | os.PathLike, name: str = "density"
     Voxel (i, j, k) becomes grid index (i, j, k); the transform maps it to `origin + (i, j, k) * spacing`, in mm. Voxels
     equal to the background are left inactive. Raises ScanError where the file can't be written.
     """
+    write_grids(path, [as_grid(volume, name)])
+
+
+def as_grid(volume: BrickVolume, name: str, scale: float = 1.0):
+    """An OpenVDB grid called `name` of the volume's values times `scale`, laid out as `save_vdb` says.
+
+    A FloatGrid, or a Vec3SGrid where each voxel holds three numbers.
+    """
     vdb = openvdb()
-    if volume.bricks.ndim != 4:
-        raise ValueError(f"only scalar volumes go into a grid, got bricks of shape {volume.bricks.shape}")
-    grid = vdb.FloatGrid(float(volume.background))
+    if volume.bricks.ndim == 4:
+        grid = vdb.FloatGrid(float(volume.background) * scale)
+    elif volume.bricks.shape[4:] == (3,):
+        grid = vdb.Vec3SGrid((float(volume.background) * scale,) * 3)
+    else:
+        raise ValueError(f"only numbers and vectors of three go into a grid, got bricks of shape {volume.bricks.shape}")
     grid.name = name
     grid.transform = linear_transform(vdb, (volume.spacing,) * 3, volume.origin)
     grid[TABLE_KEY] = " ".join(str(n) for n in volume.table.shape)
     for low, brick in zip((volume.brick_index * BRICK).tolist(), volume.bricks, strict=True):
-        grid.copyFromArray(np.ascontiguousarray(brick, np.float32), ijk=tuple(low), tolerance=0.0)
-    write_grids(path, [grid])
+        grid.copyFromArray(np.multiply(brick, np.float32(scale), dtype=np.float32), ijk=tuple(low))
+    return grid
 
 
 def load_vdb(path: str | os.PathLike, name: str | None = None) -> BrickVolume:

@@ -12,6 +12,7 @@ from mathutils import Matrix
 
 from ct2hair_addon import scene
 from ct2hair_addon.errors import CT2HairError
+from ct2hair_addon.scene.attributes import read_attribute
 from ct2hair_addon.settings import ScanSettings, Settings
 from ct2hair_addon.strand_files import read_strands
 from ct2hair_addon.strands import Strands
@@ -408,12 +409,22 @@ def test_only_our_own_is_cleared_from_the_cache(tmp_path, monkeypatch):
 def test_a_stopped_job_shows_its_stage(job_folder):
     report = json.loads((job_folder / "report.json").read_text(encoding="utf-8"))
     state = {"program": {"version": "0.1.0"}, "settings": {}, **{key: report[key] for key in ("scan", "head")}}
-    for until, kinds in (("scan", {"VOLUME"}), ("head", {"VOLUME", "MESH"}), ("guides", {"VOLUME", "MESH", "CURVES"})):
+    along_x = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]], np.float32)
+    lines = Strands(np.concatenate([along_x, along_x + 1]), np.array([0, 2, 4]), {"confidence": np.ones(2, np.float32)})
+    lines.transformed(np.array(report["head"]["head_to_scan"])).save(job_folder / "orientation.npz")
+    kinds_of = {"scan": {"VOLUME"}, "head": {"VOLUME", "MESH"}, "orientation": {"VOLUME", "MESH", "CURVES"}}
+    kinds_of["guides"] = kinds_of["orientation"]
+    for until, kinds in kinds_of.items():
         head = {} if until == "scan" else state["head"]
         (job_folder / "stage.json").write_text(json.dumps({**state, "until": until, "head": head}))
         collection = scene.load_stage(job_folder)
         assert {ob.type for ob in collection.all_objects} - {"EMPTY"} == kinds, until
         assert collection["ct2hair_folder"] == str(job_folder.resolve())
+        if until == "orientation":
+            shown = next(ob for ob in collection.all_objects if ob.type == "CURVES")
+            direction = read_attribute(shown.data, "direction")
+            np.testing.assert_allclose(np.abs(direction), [[1, 0, 0]] * 2, atol=1e-4)  # along x of the head again
+            assert len(read_attribute(shown.data, "confidence")) == 2
         scene.remove_collection(collection)
     (job_folder / "stage.json").write_text("{}")
     with pytest.raises(CT2HairError, match="not the state of a job"):

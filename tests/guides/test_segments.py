@@ -9,6 +9,7 @@ import pytest
 
 from ct2hair_addon.errors import Cancelled
 from ct2hair_addon.guides import find_segments, stage, trace_guides
+from ct2hair_addon.guides.course import DOUBT, course_at, hair_course
 from ct2hair_addon.guides.sampling import centred, density_at
 from ct2hair_addon.guides.seeds import seed_voxels
 from ct2hair_addon.guides.trace import add_strand, smoothed
@@ -42,9 +43,11 @@ def seeds_of(field):
     return seed_voxels(field.confidence, field.direction, 0)
 
 
-def traced(volume, **changes):
+def traced(volume, unsure=False, **changes):
+    """The segments, in voxels. unsure: without heed to the hair's course."""
     field = orientation_field(volume, 0.35 * PEAK, OrientationSettings())
-    segments, profile, tally = find_segments(volume, 0.35 * PEAK, seeds_of(field), GuideSettings(**changes))
+    course = hair_course(field.direction, field.direction.like(np.uint8) if unsure else field.confidence)
+    segments, profile, tally = find_segments(volume, 0.35 * PEAK, course, seeds_of(field), GuideSettings(**changes))
     return [volume.to_voxel(line) for line in segments.polylines()], profile, tally
 
 
@@ -70,7 +73,8 @@ def test_neighbours_that_touch_are_both_found():
     curves = [straight((8, 20, 20), (56, 20, 20)), straight((8, 22.2, 20), (56, 22.2, 20)), straight((8, 40, 40), (56, 44, 40))]
     lines, _, _ = traced(scan(curves, (64, 64, 64)))
     for curve in curves:
-        assert max(np.mean(distances(curve, line) < 0.7) for line in lines) > 0.8
+        nearest = np.min([distances(curve, line) for line in lines], axis=0)
+        assert np.mean(nearest < 0.7) > 0.8  # in one piece or, to be joined, in several
     assert sum(len(line) for line in lines) < 1.2 * sum(len(curve) for curve in curves)
 
 
@@ -120,7 +124,36 @@ def test_cancelling_passes_through():
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        find_segments(volume, 0.35 * PEAK, seeds_of(field), GuideSettings(), stop)
+        course = hair_course(field.direction, field.confidence)
+        find_segments(volume, 0.35 * PEAK, course, seeds_of(field), GuideSettings(), stop)
+
+
+def test_traces_in_a_bundle_keep_to_the_course_of_the_hair():
+    apart = np.arange(-3, 4) * 1.2
+    bundle = [straight((8, 30 + a, 30 + b), (120, 30 + a, 30 + b)) for a in apart for b in apart]
+    volume = scan(bundle, (128, 64, 64), snr=4.0)
+
+    def off_course(unsure):
+        lines = [np.diff(line[::4], axis=0) for line in traced(volume, unsure)[0] if len(line) > 20]
+        steps = np.concatenate(lines)
+        return np.degrees(np.mean(np.arccos(np.abs(steps[:, 0]) / np.linalg.norm(steps, axis=1))))
+
+    assert off_course(False) < 0.6 * off_course(True)
+
+
+def test_a_direction_of_the_course_is_as_long_as_it_is_sure():
+    volume = scan([straight((8, 8, 8), (8, 8, 24))], (32, 32, 32))
+    direction, confidence = volume.like(np.int8, (3,)), volume.like(np.uint8)
+    direction.bricks[:] = (0, 0, 100)
+    for place, sure in (((8, 8, 8), 1.0), ((8, 8, 9), 1.0 - DOUBT)):
+        confidence.bricks[0, *place] = round(255 * sure)
+    course = hair_course(direction, confidence)
+    row = int(volume.table[0, 0, 0])
+    assert row == 0
+    for place, expected in (((8.3, 7.6, 8.0), 1.0), ((8, 8, 9), 0.5), ((8, 8, 10), 0.0), ((-9, 0, 0), 0.0), ((900, 0, 0), 0.0)):
+        x, y, z, trust = course_at(course.table, course.bricks, *map(float, place))
+        assert abs(trust - expected) < 0.02
+        assert (x, y, z) == (0.0, 0.0, 1.0 if expected else 0.0)
 
 
 def test_density_is_trilinear_across_bricks():

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.errors import Cancelled
-from ct2hair_addon.orientation import noise_level, orientation_field
+from ct2hair_addon.orientation import OrientationField, noise_level, orientation_field
 from ct2hair_addon.orientation.eigen import smallest_eigenvector
 from ct2hair_addon.orientation.filters import derivative_taps, filter_x, filter_y, filter_z, gaussian_taps, noise_gain
 from ct2hair_addon.settings import OrientationSettings
 from ct2hair_addon.volume import BrickVolume
+from ct2hair_addon.volume.openvdb_module import openvdb
 
 PEAK = 100.0
 BLUR = 0.85
@@ -146,3 +147,40 @@ def test_the_gain_of_noise_is_measured():
     noise = np.random.default_rng(0).normal(size=(60, 60, 60)).astype(np.float32)
     gradient = filter_x(filter_y(filter_z(noise, smooth), smooth), slope)
     assert gradient.var() == pytest.approx(noise_gain(smooth, slope), rel=0.1)
+
+
+def one_voxel_field():
+    """A field with a direction at one voxel: along y, at (11, 3.5, 5.5) mm."""
+    direction, sure = np.zeros((32, 16, 16, 3), np.int8), np.zeros((32, 16, 16), np.uint8)
+    sure[20, 3, 5], direction[20, 3, 5] = 51, (0, 127, 0)
+    bricks = BrickVolume.from_dense(sure, 0.5, (1.0, 2.0, 3.0))
+    return OrientationField(BrickVolume(bricks.table, direction.reshape(2, 16, 16, 16, 3)[1:], 0.5, bricks.origin), bricks, {})
+
+
+def test_voxels_and_lines_lie_where_the_field_has_a_direction():
+    places, directions, confidence = one_voxel_field().voxels(10)
+    np.testing.assert_allclose(places, [[11.0, 3.5, 5.5]])
+    np.testing.assert_array_equal(directions, [[0, 1, 0]])
+    np.testing.assert_allclose(confidence, [0.2])
+    lines = one_voxel_field().lines()
+    np.testing.assert_allclose(lines.points, [[11.0, 3.25, 5.5], [11.0, 3.75, 5.5]])
+    np.testing.assert_allclose(lines.strand_attributes["confidence"], [0.2])
+
+
+def test_no_more_voxels_than_asked_for_the_same_each_time():
+    volume, _ = line((1.0, 0.3, 0.2), (64, 64, 64))
+    field = orientation_field(BrickVolume.from_dense(tube(volume, (64, 64, 64)), 1.0), 0.35 * PEAK)
+    places = field.voxels(50)[0]
+    assert len(np.unique(places, axis=0)) == 50
+    np.testing.assert_array_equal(places, field.voxels(50)[0])
+
+
+def test_a_saved_field_is_two_grids_in_the_scan_frame(tmp_path):
+    one_voxel_field().save(tmp_path / "orientation.vdb")
+    vdb = openvdb()
+    for name, expected in (("orientation", (0.0, 1.0, 0.0)), ("confidence", 0.2)):
+        grid = vdb.read(str(tmp_path / "orientation.vdb"), name)
+        assert grid.activeVoxelCount() == 1
+        index = tuple(round(n) for n in grid.transform.worldToIndex((11.0, 3.5, 5.5)))
+        np.testing.assert_allclose(grid.getConstAccessor().getValue(index), expected, atol=1e-6)
+    assert [file.name for file in tmp_path.iterdir()] == ["orientation.vdb"]

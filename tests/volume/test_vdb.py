@@ -76,8 +76,8 @@ def test_another_programs_grid_is_laid_round_its_voxels_in_the_same_frame(tmp_pa
 
 
 def test_what_is_no_plain_volume_is_refused(volume, tmp_path):
-    with pytest.raises(ValueError, match="only scalar volumes"):
-        save_vdb(volume.like(np.float32, (3,)), tmp_path / "wig.vdb")
+    with pytest.raises(ValueError, match="only numbers and vectors of three"):
+        save_vdb(volume.like(np.float32, (2,)), tmp_path / "wig.vdb")
     with pytest.raises(ScanError, match=r"absent/wig\.vdb: the grid can't be written .*check the folder"):
         save_vdb(volume, tmp_path / "absent" / "wig.vdb")
     with pytest.raises(ScanError, match=r"wig\.vdb: there is no such file"):
