@@ -187,17 +187,7 @@ class _Job:
         )
         refined = self._stage(
             "refinement",
-            lambda progress: refine(
-                dense.strands,
-                density,
-                level,
-                head,
-                wanted,
-                seed,
-                progress=progress,
-                # made again rather than kept: it is large, and quickly made
-                field=lambda progress: self._orientation(density, level, progress).sample,
-            ),
+            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress),
         )
         tallies = {
             "scan": wig.tally,

@@ -168,13 +168,6 @@ class RefinementSettings:
     prune: bool = parameter(
         True, "volume: made-up strands and tips that explain nothing of the scan go, and traced strands that only double others"
     )
-    follow: float = parameter(
-        12.0,
-        "volume: waves of smooth strands shorter than this give way to the orientation field before the fit; 0 leaves them",
-        unit="voxel",
-        low=0.0,
-        high=100.0,
-    )
     coarsest: float = parameter(
         1.0,
         "volume: largest voxel of the coarse-to-fine search, in the scan's: how far strands are drawn; 1 takes the scan alone",

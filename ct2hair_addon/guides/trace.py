@@ -39,8 +39,11 @@ OFF_COURSE = 4.0
 """Share of a strand's density that a step square to the hair's course must win to be taken, where the course is sure."""
 OTHER_HAIR = 0.8
 """Cosine to the course below which it is that of other hair."""
-DRAWN = 0.08
-"""Share of a step by which a path is drawn to the density's ridge with each: more, and it is drawn over to a neighbour."""
+DRAWN = (0.3, 0.08)
+"""Share of a step by which a path is drawn to the density's ridge with each, where the course is unsure, a curl, say, and where
+it is sure: there more than this would draw it over to a neighbour."""
+SURE = 1 / 3
+"""The course's trust from which on it is sure: that of a confidence of 0.93."""
 SUPPORT = 0.4
 """Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
 SHARPNESS = 0.06
@@ -104,7 +107,9 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
             bx, by, bz = scale * bx, scale * by, scale * bz
         best, chosen, backed = -1e30, 0, 0.0
         cx, cy, cz, trust = course_at(table, course, x, y, z)
-        off = OFF_COURSE * trust if abs(cx * dx + cy * dy + cz * dz) > OTHER_HAIR else 0.0
+        if abs(cx * dx + cy * dy + cz * dz) < OTHER_HAIR:
+            trust = 0.0
+        off, drawn = OFF_COURSE * trust, DRAWN[0] + (DRAWN[1] - DRAWN[0]) * min(trust / SURE, 1.0)
         for n in range(len(fan)):
             a, b = fan[n, 0], fan[n, 1]
             ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
@@ -143,7 +148,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
-        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, DRAWN * step)
+        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step)
         # Inertia: the new direction leans on the last few steps' secant.
         if count >= 4:
             sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]

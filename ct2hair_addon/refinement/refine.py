@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,6 @@ from .agreement import agreements
 from .boundary import Boundary
 from .curves import control_points, crowding, eased, easing_lengths, mean_curvature, polylines
 from .fit import fit_to_volume
-from .following import Field, along_field
 from .pruning import prune
 
 MISPLACED = 2.0
@@ -48,14 +46,12 @@ def refine(
     seed: int = 0,
     progress: Progress = silent,
     profile: StrandProfile | None = None,
-    field: Callable[[Progress], Field] | None = None,
 ) -> Refined:
     """Fit strands to the scan that they came from: roots stay where they are, lengths and curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
-    measured on the strands where not given. field: computes the scan's orientation field, which smooth hair is drawn along
-    before it is fitted; without it, it isn't. The same input and seed give the same bits on any number of threads. Raises
+    measured on the strands where not given. The same input and seed give the same bits on any number of threads. Raises
     Cancelled (by progress).
     """
     settings = settings or RefinementSettings()
@@ -71,7 +67,7 @@ def refine(
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     start = kept
     if settings.iterations and settings.method == "volume":
-        start = _eased(kept, density, profile, settings, field, part(progress, 0.05, 0.1))
+        start = _eased(kept, density, profile)
     points, offsets = control_points(start, settings.points)
     given = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
@@ -107,21 +103,11 @@ def refine(
     return Refined(result, tally, {"before": before, "after": after})
 
 
-def _eased(
-    strands: Strands,
-    density: BrickVolume,
-    profile: StrandProfile,
-    settings: RefinementSettings,
-    field: Callable[[Progress], Field] | None,
-    progress: Progress,
-) -> Strands:
-    """The strands, points a voxel apart, along the field and without the noise of tracing; curls as they were traced."""
+def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> Strands:
+    """The strands, points a voxel apart, without the noise of tracing; curls as they were traced."""
     voxel = density.spacing
     crowded = crowding(strands, density, profile.peak)
     lengths = easing_lengths(mean_curvature(strands, voxel, crowded), voxel, crowded)
-    if field is not None and settings.follow and lengths.any():
-        reach = np.where(lengths > 0.0, crowded * settings.follow * voxel, 0.0)
-        strands = along_field(strands, reach, field(part(progress, 0.0, 0.7)), voxel, part(progress, 0.7, 1.0))
     even = strands.resampled_by_step(voxel)
     points = eased(even.points, even.offsets, lengths, voxel, crowded)
     return Strands(points.astype(np.float32), even.offsets)

@@ -144,32 +144,6 @@ def test_nothing_is_left_inside_the_head(head, profile):
     assert result.tips is not None and np.median(off(result, truth)) < 0.25
 
 
-def test_the_field_is_asked_once_and_for_smooth_hair_alone(head, profile):
-    asked = []
-
-    def field(progress):
-        asked.append(1)
-        progress(1.0, 1.0)
-
-        def radial(points):
-            return points / np.linalg.norm(points, axis=1, keepdims=True), np.ones(len(points), np.float32)
-
-        return radial
-
-    for kind, times in (("straight", 1), ("curly", 0)):
-        make, by = KINDS[kind]
-        points, d = make()
-        truth, given = Strands.from_array(points), Strands.from_array(displaced(points, d, by))
-        asked.clear()
-        result = refine(given, render_density(truth, SPACING, BLUR), LEVEL, head, profile=profile, field=field)
-        assert len(asked) == times, kind
-        assert np.median(off(result.strands, truth)) < 0.25
-    refine(
-        given, render_density(truth, SPACING, BLUR), LEVEL, head, RefinementSettings(follow=0.0), profile=profile, field=field
-    )
-    assert not asked
-
-
 def test_the_same_input_gives_the_same_bits_on_any_number_of_threads(fitted, head, profile):
     _, given, result, density = fitted["straight"]
     before = numba.get_num_threads()
