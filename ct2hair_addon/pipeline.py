@@ -26,7 +26,7 @@ from .guides import Guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
-from .orientation import OrientationField, orientation_field
+from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, refine
 from .settings import STOPS, Settings
@@ -108,8 +108,8 @@ def reconstruct(
     """Reconstruct the hair of a scan into the folder `out`.
 
     Writes hair.npz, guides.npz (`Strands`, mm, scan frame), head.obj, volume.vdb (the wig's density), report.json and
-    report.html, each whole or not at all. Finished stages are kept in `out/checkpoints`: the same call goes on after the
-    last one whose input and settings are unchanged.
+    report.html, each whole or not at all; with `settings.run.orientation` orientation.vdb, too. Finished stages are kept in
+    `out/checkpoints`: the same call goes on after the last one whose input and settings are unchanged.
 
     raw_shape (x, y, z) and raw_type (a numpy type, "<u2" say) describe a raw file. template: a head mesh in the head frame
     instead of `settings.head.mesh`. until: one of `STOPS`: stop after that stage, write what there is by then (volume.vdb,
@@ -267,6 +267,10 @@ class _Job:
         hair.save(self.out / "hair.npz")
         guides.save(self.out / "guides.npz")
         registration.head.save(self.out / "head.obj")
+        progress(0.1, 1.0)
+        if self.settings.run.orientation:
+            field = self._orientation(wig.density, wig.hair_level, part(progress, 0.1, 0.2))
+            field_along(field, guides, part(progress, 0.2, 0.3)).save(self.out / "orientation.vdb")
         progress(0.3, 1.0)
         lengths = hair.lengths()
         summary = {

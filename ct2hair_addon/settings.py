@@ -201,6 +201,9 @@ class RunSettings:
     memory: float = parameter(
         0.0, "memory to stay under; 0 takes three quarters of the machine's", unit="GB", low=0.0, high=4096.0
     )
+    orientation: bool = parameter(
+        False, "the orientation field, with the traced strands' directions in it, is written as well: orientation.vdb"
+    )
 
 
 @dataclass(frozen=True)

@@ -125,8 +125,11 @@ def test_stopped_after_each_stage_it_shows_what_there_is_and_ends_as_if_it_had_n
         assert json.loads((out / "stage.json").read_text(encoding="utf-8"))["until"] == stage
     lines = Strands.load(out / "orientation.npz")
     assert len(lines) == LINES and set(lines.counts) == {2}
-    pipeline.reconstruct(scan, out, SETTINGS)
+    estimated = (out / "orientation.vdb").read_bytes()
+    made = pipeline.reconstruct(scan, out, SETTINGS.changed({"run.orientation": True}))
+    assert all(stage["resumed"] for stage in made.report["stages"] if stage["name"] in ("scan", "head", "guides", "dense"))
     assert (out / "hair.npz").read_bytes() == (result[0] / "hair.npz").read_bytes()
+    assert (out / "orientation.vdb").read_bytes() != estimated  # with the guides in it
     with pytest.raises(CT2HairError, match="unknown stage 'end'"):
         pipeline.reconstruct(scan, out, SETTINGS, until="end")
 

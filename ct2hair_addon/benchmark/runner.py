@@ -30,7 +30,7 @@ from ..evaluation import (
 )
 from ..head import Head, HeadMesh, load_obj, remove_hairnet, template_head
 from ..measure import Meter, machine_memory
-from ..orientation import orientation_field
+from ..orientation import field_along, orientation_field
 from ..pipeline import Silent, reconstruct
 from ..settings import Settings
 from ..strands import Strands
@@ -155,7 +155,7 @@ class Bench:
             "scores": scores,
             "registration_mm": registration_error(made.head, scan.head),
             "axes": [made.report["head"]["face_axis"], made.report["head"]["up_axis"]],
-            "orientation": orientation_scores(density, level, settings, scan.truth),
+            "orientation": orientation_scores(density, level, settings, scan.truth, made.guides),
             "stages": stages,
             "tallies": {stage["name"]: stage["tally"] for stage in made.report["stages"]},
             "load": self.load,
@@ -167,18 +167,16 @@ class Bench:
             shutil.rmtree(self.folder / "runs", ignore_errors=True)
 
 
-def orientation_scores(density: BrickVolume, level: float, settings: Settings, truth: Strands) -> dict[str, float]:
-    """Error of the orientation field at hair voxels (degrees), seconds, and hair voxels a second."""
+def orientation_scores(
+    density: BrickVolume, level: float, settings: Settings, truth: Strands, guides: Strands
+) -> dict[str, Any]:
+    """Error of the orientation field at hair voxels (degrees), and with the guides' directions in it (`traced`); seconds, and
+    hair voxels a second, of the former."""
     meter = Meter()
     field = orientation_field(density, level, settings.orientation)
-    seconds = meter.seconds
-    points, directions, _ = field.voxels(ORIENTED)
-    return {
-        **orientation_error(points, directions, truth),
-        "seconds": seconds,
-        "hair_voxels": field.tally["hair voxels"],
-        "peak_memory": meter.peak_memory,
-    }
+    cost = {"seconds": meter.seconds, "hair_voxels": field.tally["hair voxels"], "peak_memory": meter.peak_memory}
+    off, traced = (orientation_error(*some.voxels(ORIENTED)[:2], truth) for some in (field, field_along(field, guides)))
+    return {**off, "traced": traced, **cost}
 
 
 def machine() -> dict[str, Any]:

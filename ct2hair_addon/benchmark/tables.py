@@ -97,17 +97,19 @@ def stage_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
     table = Table(
         "Stages by themselves",
         (
-            "style", "method", "scalp off (median mm)", "orientation off (median / 90 %, degrees)", "centre line off (voxels)",
-            "covered", "direction right", "length on scalp", "guides",
+            "style", "method", "scalp off (median mm)", "orientation off (median / 90 %, degrees)", "once traced",
+            "centre line off (voxels)", "covered", "direction right", "length on scalp", "guides",
         ),
-        note="Orientation at hair voxels; centre line of guides, median; covered: hair voxels with a guide within 2.5 voxels; "
-        "direction root to tip and length on strands that reach the scalp, of the guides' length.",
+        note="Orientation at hair voxels, by gradients, and with the guides' directions in it; centre line of guides, median; "
+        "covered: hair voxels with a guide within 2.5 voxels; direction root to tip and length on strands that reach the scalp, "
+        "of the guides' length.",
     )  # fmt: skip
     for (row, method), result in results.items():
         guides, off = result["scores"]["guides"], result["orientation"]
         table.rows.append(
             (
                 row, method, result["registration_mm"]["median"], f"{off['median']:.1f} / {off['p90']:.1f}",
+                f"{off['traced']['median']:.1f} / {off['traced']['p90']:.1f}",
                 guides["centre_line_mm"]["median"] / result["case"]["spacing"], guides["coverage"],
                 guides["direction"]["right"], guides["rooted_length"], guides["counts"]["result_strands"],
             )

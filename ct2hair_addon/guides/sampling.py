@@ -7,6 +7,9 @@ import numpy as np
 
 from ..volume.grid import trilinear
 
+WHOLE = 127.0
+"""Length, in int8, of a direction that is trusted wholly."""
+
 
 @numba.njit(cache=True, nogil=True)
 def density_at(table, bricks, x, y, z):
@@ -30,6 +33,29 @@ def density_at(table, bricks, x, y, z):
     high = (brick[a + 1, b, c] * (1.0 - w) + brick[a + 1, b, c + 1] * w) * (1.0 - v)
     high += (brick[a + 1, b + 1, c] * (1.0 - w) + brick[a + 1, b + 1, c + 1] * w) * v
     return low * (1.0 - u) + high * u
+
+
+@numba.njit(cache=True, nogil=True)
+def course_at(table, bricks, x, y, z):
+    """(x, y, z, trust): the unit direction, sign without meaning, at the voxel nearest to (x, y, z), and 0 to 1; 0 off hair.
+
+    bricks: int8 (B, 16, 16, 16, 3), vectors as long as they are trusted, WHOLE at most.
+    """
+    i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
+    if i < 0 or j < 0 or k < 0:
+        return 0.0, 0.0, 0.0, 0.0
+    I, J, K = i >> 4, j >> 4, k >> 4
+    if I >= table.shape[0] or J >= table.shape[1] or K >= table.shape[2]:
+        return 0.0, 0.0, 0.0, 0.0
+    row = table[I, J, K]
+    if row < 0:
+        return 0.0, 0.0, 0.0, 0.0
+    d = bricks[row, i & 15, j & 15, k & 15]
+    dx, dy, dz = float(d[0]), float(d[1]), float(d[2])
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    if length == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    return dx / length, dy / length, dz / length, length / WHOLE
 
 
 @numba.njit(cache=True, nogil=True)

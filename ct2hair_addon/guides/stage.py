@@ -13,7 +13,6 @@ from ..settings import GuideSettings
 from ..strands import Strands
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile
-from .course import hair_course
 from .direction import fine_ends, signs
 from .growing import grow_to_root, lead_into_scalp, push_out
 from .linking import cut_segments, link_segments, meeting_ends
@@ -30,10 +29,13 @@ COARSEST = 1.0
 
 class HairField(Protocol):
     """What tracing needs of the orientation field: `direction` int8 (B, 16, 16, 16, 3), unit * 127, and `confidence` uint8
-    (B, 16, 16, 16), above 0 where there is hair, in the density's bricks."""
+    (B, 16, 16, 16), above 0 where there is hair, in the density's bricks; and `course`, the former 127 times as long as each is
+    to be trusted, by the latter."""
 
     direction: BrickVolume
     confidence: BrickVolume
+
+    def course(self) -> BrickVolume: ...
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def find_segments(
 ) -> tuple[Strands, StrandProfile, dict[str, int]]:
     """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing.
 
-    course: which way hair goes, in the density's bricks (`hair_course`).
+    course: which way hair goes, in the density's bricks (`HairField.course`).
     """
     profile = _profile(density, hair_level, seeds)
     order = seed_order(density, *seeds, profile, part(progress, 0.0, 0.15))
@@ -100,7 +102,7 @@ def trace_guides(
     if settings.method == "paper":
         strands, tally = paper_guides(density, field.direction, field.confidence, head, settings, seed, progress)
         return Guides(strands, _profile(density, hair_level, seeds), tally)
-    way = hair_course(field.direction, field.confidence)
+    way = field.course()
     del field  # as large as the density in float32: its memory is free from here on if the caller, too, has let go of it
     segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85))
     del seeds, way

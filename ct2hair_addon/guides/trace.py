@@ -18,8 +18,7 @@ from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, add_strand
-from .course import course_at
-from .sampling import centred, density_at, line_mean, plane
+from .sampling import centred, course_at, density_at, line_mean, plane
 
 MOST_STEPS = 3000
 """Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
@@ -332,7 +331,7 @@ def trace_segments(
 ) -> Segments:
     """Trace and subtract from the seeds in their order until none is left. `residual.bricks` is used up: pass a copy.
 
-    course: which way hair goes, in the same bricks (`hair_course`). voxels, directions: (S, 3) seeds; order: indices into
+    course: which way hair goes, in the same bricks (`HairField.course`). voxels, directions: (S, 3) seeds; order: indices into
     them. The result is the same on any number of threads.
     """
     shortest = max(int(settings.min_length / (settings.step * residual.spacing)), 6)

@@ -16,6 +16,7 @@ from ..volume.grid import BRICK, BrickVolume, gather
 from .eigen import smallest_eigenvector
 from .filters import box_taps, derivative_taps, gaussian_taps, gradients, noise_gain, tensor
 from .gabor import DIRECTIONS, half_sphere, kernels, orient_by_filters
+from .trust import trusted
 
 BLOCK = 4
 """Bricks along one edge of a work block: 64 voxels keep a thread's scratch near 30 MB and the halo's share bearable."""
@@ -53,6 +54,10 @@ class OrientationField:
         direction, confidence = _nearest(self.direction.table, self.direction.bricks, self.confidence.bricks, voxels)
         norm = np.linalg.norm(direction, axis=1, keepdims=True)
         return direction / np.where(norm > 0, norm, 1.0).astype(np.float32), confidence
+
+    def course(self) -> BrickVolume:
+        """int8 (B, 16, 16, 16, 3): the directions, 127 times as long as each is to be trusted: what a trace keeps to."""
+        return trusted(self.direction, self.confidence)
 
     def voxels(self, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(M, 3) mm, (M, 3) unit float32, (M,) 0 to 1: place, direction and confidence of at most `most` voxels, drawn with a

@@ -9,8 +9,7 @@ import pytest
 
 from ct2hair_addon.errors import Cancelled
 from ct2hair_addon.guides import find_segments, stage, trace_guides
-from ct2hair_addon.guides.course import DOUBT, course_at, hair_course
-from ct2hair_addon.guides.sampling import centred, density_at
+from ct2hair_addon.guides.sampling import centred, course_at, density_at
 from ct2hair_addon.guides.seeds import seed_voxels
 from ct2hair_addon.guides.trace import add_strand, smoothed
 from ct2hair_addon.orientation import orientation_field
@@ -46,7 +45,7 @@ def seeds_of(field):
 def traced(volume, unsure=False, **changes):
     """The segments, in voxels. unsure: without heed to the hair's course."""
     field = orientation_field(volume, 0.35 * PEAK, OrientationSettings())
-    course = hair_course(field.direction, field.direction.like(np.uint8) if unsure else field.confidence)
+    course = field.direction.like(np.int8, (3,)) if unsure else field.course()
     segments, profile, tally = find_segments(volume, 0.35 * PEAK, course, seeds_of(field), GuideSettings(**changes))
     return [volume.to_voxel(line) for line in segments.polylines()], profile, tally
 
@@ -124,8 +123,7 @@ def test_cancelling_passes_through():
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        course = hair_course(field.direction, field.confidence)
-        find_segments(volume, 0.35 * PEAK, course, seeds_of(field), GuideSettings(), stop)
+        find_segments(volume, 0.35 * PEAK, field.course(), seeds_of(field), GuideSettings(), stop)
 
 
 def test_traces_in_a_bundle_keep_to_the_course_of_the_hair():
@@ -139,21 +137,6 @@ def test_traces_in_a_bundle_keep_to_the_course_of_the_hair():
         return np.degrees(np.mean(np.arccos(np.abs(steps[:, 0]) / np.linalg.norm(steps, axis=1))))
 
     assert off_course(False) < 0.6 * off_course(True)
-
-
-def test_a_direction_of_the_course_is_as_long_as_it_is_sure():
-    volume = scan([straight((8, 8, 8), (8, 8, 24))], (32, 32, 32))
-    direction, confidence = volume.like(np.int8, (3,)), volume.like(np.uint8)
-    direction.bricks[:] = (0, 0, 100)
-    for place, sure in (((8, 8, 8), 1.0), ((8, 8, 9), 1.0 - DOUBT)):
-        confidence.bricks[0, *place] = round(255 * sure)
-    course = hair_course(direction, confidence)
-    row = int(volume.table[0, 0, 0])
-    assert row == 0
-    for place, expected in (((8.3, 7.6, 8.0), 1.0), ((8, 8, 9), 0.5), ((8, 8, 10), 0.0), ((-9, 0, 0), 0.0), ((900, 0, 0), 0.0)):
-        x, y, z, trust = course_at(course.table, course.bricks, *map(float, place))
-        assert abs(trust - expected) < 0.02
-        assert (x, y, z) == (0.0, 0.0, 1.0 if expected else 0.0)
 
 
 def test_density_is_trilinear_across_bricks():
@@ -200,3 +183,13 @@ def test_the_orientation_field_is_let_go_of_before_tracing(monkeypatch):
     monkeypatch.setattr(stage, "find_segments", find)
     with pytest.raises(Cancelled):
         trace_guides(volume, 0.35 * PEAK, fields.pop(), None)
+
+
+def test_the_course_is_read_at_the_nearest_voxel_with_how_far_it_is_trusted():
+    course = scan([straight((8, 8, 8), (8, 8, 24))], (32, 32, 32)).like(np.int8, (3,))
+    row = int(course.table[0, 0, 0])
+    course.bricks[row, 8, 8, 8], course.bricks[row, 8, 8, 9] = (0, 0, 127), (0, 0, 64)
+    for place, expected in (((8.3, 7.6, 8.0), 1.0), ((8, 8, 9), 0.5), ((8, 8, 10), 0.0), ((-9, 0, 0), 0.0), ((900, 0, 0), 0.0)):
+        x, y, z, trust = course_at(course.table, course.bricks, *map(float, place))
+        assert abs(trust - expected) < 0.01
+        assert (x, y, z) == (0.0, 0.0, 1.0 if expected else 0.0)
