@@ -101,8 +101,8 @@ def stage_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
             "centre line off (voxels)", "covered", "direction right", "length on scalp", "guides",
         ),
         note="Orientation at hair voxels, by gradients, and with the guides' directions in it; centre line of guides, median; "
-        "covered: hair voxels with a guide within 2.5 voxels; direction root to tip and length on strands that reach the scalp, "
-        "of the guides' length.",
+        "covered: hair voxels with a guide within 2.5 voxels; direction root to tip and length on strands that reach the "
+        "scalp, of the guides' length.",
     )  # fmt: skip
     for (row, method), result in results.items():
         guides, off = result["scores"]["guides"], result["orientation"]
