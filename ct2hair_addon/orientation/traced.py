@@ -58,13 +58,16 @@ def field_along(field: OrientationField, strands: Strands, progress: Progress = 
 def _blend(index, first, end, shape, starts, places, tangents, own, sure, direction, confidence):
     for row in numba.prange(first, end):
         sums = np.zeros((BRICK, BRICK, BRICK, 6), np.float32)
+        near = np.empty((3, 2 * REACH + 1), np.float32)
         low = BRICK * index[row]
         for I in range(index[row, 0], index[row, 0] + 3):
             for J in range(index[row, 1], index[row, 1] + 3):
                 for K in range(index[row, 2], index[row, 2] + 3):
                     key = (I * shape[1] + J) * shape[2] + K
                     for n in range(starts[key], starts[key + 1]):
-                        _add(sums, places[n] - low, tangents[n])
+                        x, y, z = places[n, 0] - low[0], places[n, 1] - low[1], places[n, 2] - low[2]
+                        if min(x, y, z) > -REACH and max(x, y, z) < BRICK - 1 + REACH:
+                            _add(sums, near, x, y, z, tangents[n, 0], tangents[n, 1], tangents[n, 2])
         for i in range(BRICK):
             for j in range(BRICK):
                 for k in range(BRICK):
@@ -92,26 +95,22 @@ def _blend(index, first, end, shape, starts, places, tangents, own, sure, direct
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(sums, place, tangent):
-    """Add a point's direction to the voxels around it; place: voxels from the brick's first."""
-    i, j, k = int(np.rint(place[0])), int(np.rint(place[1])), int(np.rint(place[2]))
-    if min(i, j, k) < -REACH or max(i, j, k) >= BRICK + REACH:
-        return
-    near = np.empty((3, 2 * REACH + 1), np.float32)
+def _add(sums, near, x, y, z, tx, ty, tz):
+    """Add the direction t of a point at (x, y, z), voxels from the brick's first, to the voxels around it; near: scratch."""
+    i, j, k = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
     for n in range(2 * REACH + 1):
-        near[0, n] = np.exp(-0.5 * (i - REACH + n - place[0]) ** 2 / NEAR**2)
-        near[1, n] = np.exp(-0.5 * (j - REACH + n - place[1]) ** 2 / NEAR**2)
-        near[2, n] = np.exp(-0.5 * (k - REACH + n - place[2]) ** 2 / NEAR**2)
-    x, y, z = tangent[0], tangent[1], tangent[2]
+        near[0, n] = np.exp(-0.5 * (i - REACH + n - x) ** 2 / NEAR**2)
+        near[1, n] = np.exp(-0.5 * (j - REACH + n - y) ** 2 / NEAR**2)
+        near[2, n] = np.exp(-0.5 * (k - REACH + n - z) ** 2 / NEAR**2)
     for a in range(max(i - REACH, 0), min(i + REACH + 1, BRICK)):
         for b in range(max(j - REACH, 0), min(j + REACH + 1, BRICK)):
             across = near[0, a - i + REACH] * near[1, b - j + REACH]
             for c in range(max(k - REACH, 0), min(k + REACH + 1, BRICK)):
                 w = across * near[2, c - k + REACH]
                 s = sums[a, b, c]
-                s[0] += w * x * x
-                s[1] += w * x * y
-                s[2] += w * x * z
-                s[3] += w * y * y
-                s[4] += w * y * z
-                s[5] += w * z * z
+                s[0] += w * tx * tx
+                s[1] += w * tx * ty
+                s[2] += w * tx * tz
+                s[3] += w * ty * ty
+                s[4] += w * ty * tz
+                s[5] += w * tz * tz
