@@ -114,8 +114,7 @@ def reconstruct(
     raw_shape (x, y, z) and raw_type (a numpy type, "<u2" say) describe a raw file. template: a head mesh in the head frame
     instead of `settings.head.mesh`. until: one of `STOPS`: stop after that stage, write what there is by then (volume.vdb,
     head.obj, orientation.vdb with lines to look at in orientation.npz, guides.npz, dense.npz) with stage.json, and return
-    None. Raises CT2HairError (bad input, said in a sentence)
-    and Cancelled (by the observer).
+    None. Raises CT2HairError (bad input, said in a sentence) and Cancelled (by the observer).
     """
     settings = settings or Settings()
     if until is not None and until not in STOPS:
@@ -234,12 +233,7 @@ class _Job:
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
             # in a list, to be handed over and held no longer: it is of the guides' peak of memory
-            fields = [
-                self._stage(
-                    "orientation",
-                    lambda progress: self._orientation(density, level, progress),
-                )
-            ]
+            fields = [self._stage("orientation", lambda progress: self._orientation(density, level, progress))]
         guides = self._stage(
             "guides",
             lambda progress: trace_guides(

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from ..volume.grid import trilinear
-
-WHOLE = 127.0
-"""Length, in int8, of a direction that is trusted wholly."""
+from ..volume.grid import UNIT, trilinear
 
 
 @numba.njit(cache=True, nogil=True)
@@ -39,7 +36,7 @@ def density_at(table, bricks, x, y, z):
 def course_at(table, bricks, x, y, z):
     """(x, y, z, trust): the unit direction, sign without meaning, at the voxel nearest to (x, y, z), and 0 to 1; 0 off hair.
 
-    bricks: int8 (B, 16, 16, 16, 3), vectors as long as they are trusted, WHOLE at most.
+    bricks: int8 (B, 16, 16, 16, 3), vectors as long as they are trusted, UNIT at most.
     """
     i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
     if i < 0 or j < 0 or k < 0:
@@ -55,7 +52,7 @@ def course_at(table, bricks, x, y, z):
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     if length == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    return dx / length, dy / length, dz / length, length / WHOLE
+    return dx / length, dy / length, dz / length, length / UNIT
 
 
 @numba.njit(cache=True, nogil=True)

@@ -28,9 +28,9 @@ COARSEST = 1.0
 
 
 class HairField(Protocol):
-    """What tracing needs of the orientation field: `direction` int8 (B, 16, 16, 16, 3), unit * 127, and `confidence` uint8
-    (B, 16, 16, 16), above 0 where there is hair, in the density's bricks; and `course`, the former 127 times as long as each is
-    to be trusted, by the latter."""
+    """What tracing needs of the orientation field: `direction` int8 (B, 16, 16, 16, 3), UNIT long, and `confidence` uint8
+    (B, 16, 16, 16), above 0 where there is hair, in the density's bricks; and `course`, the former as long as each is to be
+    trusted by the latter, UNIT at most."""
 
     direction: BrickVolume
     confidence: BrickVolume

@@ -12,7 +12,7 @@ from ..progress import Progress, silent
 from ..settings import OrientationSettings
 from ..strands import Strands
 from ..volume import as_grid, write_grids
-from ..volume.grid import BRICK, BrickVolume, gather
+from ..volume.grid import BRICK, UNIT, BrickVolume, gather
 from .eigen import smallest_eigenvector
 from .filters import box_taps, derivative_taps, gaussian_taps, gradients, noise_gain, tensor
 from .gabor import DIRECTIONS, half_sphere, kernels, orient_by_filters
@@ -26,8 +26,6 @@ sigma^2),
 and the hair level with it, so that a lone strand stays hair whatever `sigma` is."""
 LINES = 200_000
 """Lines that show a field, unless it is said how many."""
-UNIT = 127.0
-"""A direction's unit length as stored in int8."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class OrientationField:
         return direction / np.where(norm > 0, norm, 1.0).astype(np.float32), confidence
 
     def course(self) -> BrickVolume:
-        """int8 (B, 16, 16, 16, 3): the directions, 127 times as long as each is to be trusted: what a trace keeps to."""
+        """int8 (B, 16, 16, 16, 3): the directions, UNIT times as long as each is to be trusted: what a trace keeps to."""
         return trusted(self.direction, self.confidence)
 
     def voxels(self, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

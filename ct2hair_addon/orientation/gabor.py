@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from ..volume.grid import BRICK, gather
+from ..volume.grid import BRICK, UNIT, gather
 from .eigen import smallest_eigenvector
 
 RADIUS = 4
@@ -95,9 +95,9 @@ def orient_by_filters(
                             yy, yz, zz = yy - weight * y * y, yz - weight * y * z, zz - weight * z * z
                     x, y, z, _small, _middle, _large = smallest_eigenvector(xx, xy, xz, yy, yz, zz)
                     counts[b, 1] += 1
-                    direction[b, i, j, k, 0] = np.int8(np.rint(127.0 * x))
-                    direction[b, i, j, k, 1] = np.int8(np.rint(127.0 * y))
-                    direction[b, i, j, k, 2] = np.int8(np.rint(127.0 * z))
+                    direction[b, i, j, k, 0] = np.int8(np.rint(UNIT * x))
+                    direction[b, i, j, k, 1] = np.int8(np.rint(UNIT * y))
+                    direction[b, i, j, k, 2] = np.int8(np.rint(UNIT * z))
                     confidence[b, i, j, k] = np.uint8(max(np.rint(255.0 * min(1.0 - mean / best, 1.0)), 1.0))
 
 

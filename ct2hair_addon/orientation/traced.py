@@ -1,7 +1,7 @@
 """The field once hair has been traced in it: the strands' own directions where they run, the gradients' in between.
 
 Where strands of several directions share a voxel, gradients gathered over all of them show none of these, while a strand that
-was followed through keeps its own: in curls of 5 mm radius at 0.4 mm the field's median error falls from 20 to some 7 degrees.
+was followed through keeps its own: in curls of 5 mm radius at 0.4 mm the field's median error falls from 20.0 to 6.4 degrees.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..strands import Strands
-from ..volume.grid import BRICK
+from ..volume.grid import BRICK, UNIT
 from .eigen import smallest_eigenvector
-from .field import UNIT, OrientationField
+from .field import OrientationField
 from .trust import trust
 
 REACH = 2
@@ -41,13 +41,14 @@ def field_along(field: OrientationField, strands: Strands, progress: Progress = 
     key = np.ravel_multi_index(tuple(brick.T), shape)
     order = np.argsort(key, kind="stable")
     starts = np.searchsorted(key[order], np.arange(int(np.prod(shape)) + 1))
+    places, tangents = places[order], tangents[order]
     direction, confidence = field.direction.like(np.int8, (3,)), field.confidence.like(np.uint8)
     index = field.direction.brick_index.astype(np.int64)
     at_once = 256 * max(numba.get_num_threads(), 1)
     for first in range(0, len(index), at_once):
         progress(first, len(index))
         _blend(
-            index, first, min(first + at_once, len(index)), shape, starts, places[order], tangents[order],
+            index, first, min(first + at_once, len(index)), shape, starts, places, tangents,
             field.direction.bricks, field.confidence.bricks, direction.bricks, confidence.bricks,
         )  # fmt: skip
     progress(1.0, 1.0)

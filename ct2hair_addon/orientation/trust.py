@@ -5,13 +5,11 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from ..volume.grid import BRICK, BrickVolume
+from ..volume.grid import BRICK, UNIT, BrickVolume
 
 DOUBT = 0.05
 """A direction whose confidence falls short of 1 by so much counts half, and less as the square of its error does: against
 the truth of made scans, directions of confidence 0.99 are 4 degrees off, of 0.95 6, of 0.85 12, of 0.65 22."""
-LENGTH = 127.0
-"""A direction that is trusted wholly is so long in int8."""
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -22,7 +20,7 @@ def trust(confidence):
 
 
 def trusted(direction: BrickVolume, confidence: BrickVolume) -> BrickVolume:
-    """int8 (B, 16, 16, 16, 3): the directions, LENGTH times as long as each is trusted, 0 where there is none.
+    """int8 (B, 16, 16, 16, 3): the directions, UNIT times as long as each is trusted, 0 where there is none.
 
     direction: int8 (B, 16, 16, 16, 3) of any length; confidence: uint8 (B, 16, 16, 16), 0..255 for 0..1.
     """
@@ -44,7 +42,7 @@ def _scale(direction, confidence, out):
                     square = x * x + y * y + z * z
                     if square == 0.0:
                         continue
-                    scale = LENGTH * trust(confidence[row, i, j, k]) / np.sqrt(square)
+                    scale = UNIT * trust(confidence[row, i, j, k]) / np.sqrt(square)
                     out[row, i, j, k, 0] = np.int8(np.rint(scale * x))
                     out[row, i, j, k, 1] = np.int8(np.rint(scale * y))
                     out[row, i, j, k, 2] = np.int8(np.rint(scale * z))

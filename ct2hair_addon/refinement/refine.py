@@ -66,8 +66,8 @@ def refine(
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     # the eased strands are as long as the voxels that they run through: not kept
-    moved = settings.iterations and settings.method == "volume"
-    points, offsets = control_points(_eased(kept, density, profile) if moved else kept, settings.points)
+    eases = settings.iterations and settings.method == "volume"
+    points, offsets = control_points(_eased(kept, density, profile) if eases else kept, settings.points)
     given = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:

@@ -94,11 +94,7 @@ def new_hair(
         raise StrandFileError(f"'{name}' has no strand of two points or more: there is nothing to show")
     if head.data.uv_layers.get(SCALP_UV) is None:
         raise HeadError(f"'{head.name}' has no UV layer '{SCALP_UV}' to attach hair by; make one with add_scalp_uv")
-    curves = new.add(bpy.data.hair_curves.new(name))
-    curves.add_curves(strands.counts.tolist())
-    curves.set_types(type="POLY")  # at once: evaluation of the default type takes a hundred times as long
-    curves.position_data.foreach_set("vector", (strands.points * np.float32(MM)).ravel())
-
+    curves = _new_curves(new, name, strands)
     radius = strands.point_attributes.get("radius")
     if radius is None:
         drawn = np.float32(0.5 * MM) * strand_diameters(len(strands), seed, diameter)
@@ -127,27 +123,30 @@ def new_hair(
     return NewHair(ob, tally)
 
 
-def new_lines(
-    new: NewData, name: str, lines: Strands, *, material: bpy.types.Material | None = None, diameter: float = 4 * DIAMETER
-) -> bpy.types.Object:
+def new_lines(new: NewData, name: str, lines: Strands, material: bpy.types.Material, diameter: float) -> bpy.types.Object:
     """A Curves object of straight `lines` (mm, two points each) as they are, on nothing, not linked yet.
 
     With every attribute of theirs and `direction` (CURVE), along which each runs. diameter: mm.
     """
     if not len(lines):
         raise StrandFileError(f"'{name}' has no line: there is nothing to show")
-    curves = new.add(bpy.data.hair_curves.new(name))
-    curves.add_curves(lines.counts.tolist())
-    curves.set_types(type="POLY")
-    curves.position_data.foreach_set("vector", (lines.points * np.float32(MM)).ravel())
+    curves = _new_curves(new, name, lines)
     write_attribute(curves, "radius", "FLOAT", "POINT", np.full(len(lines.points), 0.5 * MM * diameter))
     along = lines.points[1::2] - lines.points[::2]
     directions = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     for key, values in {**lines.strand_attributes, "direction": directions}.items():
         _write_array(curves, key, "CURVE", np.asarray(values))
-    if material is not None:
-        curves.materials.append(material)
+    curves.materials.append(material)
     return new.add(bpy.data.objects.new(name, curves))
+
+
+def _new_curves(new: NewData, name: str, strands: Strands) -> bpy.types.Curves:
+    """Curves through the points of `strands` (mm), in metres, without an attribute yet."""
+    curves = new.add(bpy.data.hair_curves.new(name))
+    curves.add_curves(strands.counts.tolist())
+    curves.set_types(type="POLY")  # at once: evaluation of the default type takes a hundred times as long
+    curves.position_data.foreach_set("vector", (strands.points * np.float32(MM)).ravel())
+    return curves
 
 
 def strands_of(ob: bpy.types.Object, evaluated: bool = False) -> Strands:

@@ -335,7 +335,7 @@ def _show_wig(grid, name, level, properties, context, mesh=None, head_to_scan=No
             _enrol(collection, new_head(new, f"{name} Head", mesh), "head", root)
         if orientation is not None:
             material = orientation_material(new, f"{name} Lines")
-            lines = new_lines(new, f"{name} Lines", orientation, material=material, diameter=0.2 * summary.spacing)
+            lines = new_lines(new, f"{name} Lines", orientation, material, 0.2 * summary.spacing)
             _enrol(collection, lines, "orientation", root)
             volume.hide_render = True  # the lines stand where the cloud does
         for key, value in properties.items():

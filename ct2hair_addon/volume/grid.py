@@ -12,6 +12,8 @@ import numpy as np
 
 BRICK = 16
 """Voxels along one edge of a brick."""
+UNIT = 127.0
+"""A direction's unit length where it is stored in int8."""
 
 
 @dataclass(frozen=True)
