@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .evaluation import hairstyle
+from .evaluation.spectrum import band_powers
 from .head import Head, template_head
 from .interpolation import Blending, EuclideanCoder, LinearCoder, NetworkCoder
 from .settings import InterpolationSettings
@@ -22,8 +23,6 @@ POINTS = 128
 LIKE_REACH = 15.0
 """Real strands rooted within this many mm are asked whether they look like a blended one."""
 NEAR_STRANDS = 24
-SPECTRUM_BANDS = ((10.0, 25.0), (25.0, 60.0), (60.0, 150.0))
-"""Wavelengths, mm of hair, over which the curvature's spectrum is compared; shorter ones are the corners of polylines."""
 
 
 def study(
@@ -129,10 +128,7 @@ def _scores(made, truth, roots) -> dict[str, float]:
 
 
 def _curvature_spectrum(tangents: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Power of the curvature (1/mm) of strands in SPECTRUM_BANDS, weighted by their lengths."""
-    count = tangents.shape[1]
-    step = length / count
+    """Power of the curvature (1/mm) of strands in the bands of `evaluation.spectrum`, weighted by their lengths."""
+    step = length / tangents.shape[1]
     curvature = np.diff(tangents, axis=1) / step[:, None, None]
-    power = (np.abs(np.fft.rfft(curvature, axis=1)) ** 2).sum(axis=2) * length[:, None] / count**2
-    wavelength = length[:, None] / np.maximum(np.arange(power.shape[1]), 0.25)
-    return np.array([power[(wavelength >= low) & (wavelength < high)].sum() for low, high in SPECTRUM_BANDS])
+    return (band_powers(curvature, step, np.full(len(length), curvature.shape[1])) * length[:, None]).sum(axis=0)

@@ -79,16 +79,17 @@ def strand_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
     """F scores, consistency, roots and points inside of each method's strands."""
     table = Table(
         "Strands (F at mm / degrees)",
-        ("style", "strands", "count", "0.5/10", "1/10", "2/20", "4/40", "consistency", "on scalp", "inside"),
+        ("style", "strands", "count", "0.5/10", "1/10", "2/20", "4/40", "consistency", "bends", "on scalp", "inside"),
+        note="Bends: the curvature's root mean square over the truth's, in waves of 10 to 25, 25 to 60 and 60 to 150 mm.",
     )
     for (row, method), result in results.items():
         for stage in ("guides", "dense", "refined"):
             scores = result["scores"][stage]
             f = [scores["strand"][name]["f"] for name in ("0.5/10", "1/10", "2/20", "4/40")]
             count = scores["counts"]["result_strands"]
-            table.rows.append(
-                (row, f"{method}: {stage}", count, *f, scores["consistency"], scores["roots_on_scalp"], scores["inside_head"])
-            )
+            bends = " / ".join(f"{rms['result'] / max(rms['truth'], 1e-9):.2f}" for rms in scores["curvature"].values())
+            ends = (scores["consistency"], bends, scores["roots_on_scalp"], scores["inside_head"])
+            table.rows.append((row, f"{method}: {stage}", count, *f, *ends))
     return table
 
 

@@ -14,6 +14,7 @@ from .scores import (
     rooted_length,
     scan_scores,
 )
+from .spectrum import curvature_spectrum
 from .synthesis import Synthesis, synthesize
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "centre_line_error",
     "coverage",
     "curvature",
+    "curvature_spectrum",
     "direction_share",
     "evaluate",
     "format_scores",

@@ -18,6 +18,7 @@ from ..volume import BRICK, BrickVolume
 from .curves import curve_arcs, sample_curves, sample_tangents
 from .density import BLUR, frame_around, render_density, render_layers, strand_peak
 from .neighbours import PointGrid, nearest_rows
+from .spectrum import curvature_spectrum
 
 VOXEL_BLUR = 0.8
 """Blur (sigma, voxels) of the volumes that are compared."""
@@ -81,13 +82,16 @@ def evaluate(
     head: the registered head in the same frame, for roots and points inside (left out without one). voxels: sizes, mm.
     queries: millimetres of strand asked at most in each direction; beyond, whole strands are drawn with a fixed seed, and
     `asked` tells how many. Keys: `voxel` {size: iou, precision, recall, mse}, `strand` {"mm/degrees": precision, recall, f},
-    `consistency`, `roots_on_scalp`, `inside_head`, `counts`.
+    `consistency`, `curvature` {"shortest-longest wave, mm": truth, result; 1/m, as `curvature_spectrum` gives it},
+    `roots_on_scalp`, `inside_head`, `counts`.
     """
     scores: dict = {"voxel": {}, "strand": {}}
     for n, size in enumerate(voxels):
         share = part(progress, 0.5 * n / len(voxels), 0.5 * (n + 1) / len(voxels))
         scores["voxel"][f"{size:g}"] = voxel_scores(truth, result, size, share)
     scores.update(strand_scores(truth, result, queries, part(progress, 0.5, 0.95)))
+    true, found = (curvature_spectrum(each.select(_drawn(_millimetres(each), queries))) for each in (truth, result))
+    scores["curvature"] = {band: {"truth": true[band], "result": found[band]} for band in true}
     if head is not None:
         scores.update(head_scores(result, head, queries))
     scores["counts"] = {
@@ -165,7 +169,7 @@ def head_scores(result: Strands, head: HeadMesh, queries: int = QUERIES) -> dict
     if not len(strands):
         return {"roots_on_scalp": 0.0, "inside_head": 0.0}
     on_scalp = surface.closest_scalp(strands.roots).distance <= ROOT_REACH
-    points = sample_curves(strands.select(_drawn(np.maximum(strands.lengths(), 1.0), queries)), 2.0 * TARGET_STEP).points
+    points = sample_curves(strands.select(_drawn(_millimetres(strands), queries)), 2.0 * TARGET_STEP).points
     depth = surface.signed_distance(points)
     return {"roots_on_scalp": float(on_scalp.mean()), "inside_head": float((depth < -INSIDE).mean())}
 
@@ -291,6 +295,8 @@ def format_scores(scores: dict) -> str:
         for name, s in scores["strand"].items()
     ]
     lines.append(f"consistency       {scores['consistency']:.3f}")
+    lines.append("bends     wave, mm  curvature  truth's (rms, 1/m)")
+    lines += [f"       {band:>8}    {rms['result']:7.2f}  {rms['truth']:7.2f}" for band, rms in scores["curvature"].items()]
     if "roots_on_scalp" in scores:
         lines.append(f"roots on scalp    {100 * scores['roots_on_scalp']:.2f} %")
         lines.append(f"inside the head   {100 * scores['inside_head']:.3f} %")
@@ -319,6 +325,11 @@ def _drawn(points: np.ndarray, queries: int) -> np.ndarray:
         return np.arange(len(points))
     order = np.random.default_rng(0).permutation(len(points))
     return np.sort(order[: max(int(np.searchsorted(np.cumsum(points[order]), queries)), 1)])
+
+
+def _millimetres(strands: Strands) -> np.ndarray:
+    """(N,) how many points each strand has at every millimetre, 1 at least."""
+    return np.maximum(strands.lengths(), 1.0)
 
 
 def _matched(source: _Samples, target: _Samples, queries: int, progress: Progress):

@@ -111,9 +111,9 @@ def _fit_batch(start, offsets, density, bins, boundary, settings, seed, device, 
         )
         loss = curve.new_zeros(())
         if len(targets):
-            reached = np.flatnonzero(found[:, 0] >= 0)
+            reached = np.flatnonzero(found >= 0)
             goal = torch.tensor(targets * density.spacing + density.origin, dtype=torch.float32, device=device)
-            pick = torch.from_numpy(found[reached, 0]).to(device)
+            pick = torch.from_numpy(found[reached]).to(device)
             ours = flat[torch.from_numpy(reached).to(device)]
             loss = loss + (ours - goal[pick]).square().sum()
             tree = cKDTree(flat.detach().cpu().numpy())
@@ -185,32 +185,36 @@ def _curve(control: torch.Tensor, weights: torch.Tensor, owners: torch.Tensor) -
 
 
 def nearest_targets(bins: BrickVolume, voxels: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` target points nearest to each of the points (M, 3) (in voxels), within SEARCH voxels.
+    """The `count` target points nearest to each of the points (M, 3) (in voxels), within SEARCH voxels, all together.
 
-    Returns found (M, count) int64 rows of targets, nearest first, -1 where there are fewer, and targets (T, 3) float64 in
-    voxels: the partial target point cloud, each point once.
+    Returns found (M,) int64, the row of the nearest target, -1 where there is none, and targets (T, 3) float64 in voxels: the
+    partial target point cloud, each point once.
     """
     codes = np.full((len(voxels), count), -1, np.int64)
     chunk = 20_000
     for at in range(0, len(voxels), chunk):
         _nearest(bins.table, bins.bricks, voxels[at : at + chunk], np.uint64(seed), codes[at : at + chunk])
-    unique, found = np.unique(codes, return_inverse=True)
-    found = found.reshape(codes.shape)
-    if len(unique) and unique[0] == -1:
-        unique, found = unique[1:], found - 1
+    unique = np.unique(codes)
+    unique = unique[np.searchsorted(unique, 0) :]
+    found = np.where(codes[:, 0] < 0, -1, np.searchsorted(unique, codes[:, 0]))
     targets = np.empty((len(unique), 3))
     _places(unique, bins.brick_index, np.uint64(seed), targets)
     return found, targets
 
 
 @numba.njit(cache=True, inline="always")
-def _jitter(code, seed, axis):
-    """A fixed number in [-0.5, 0.5) for a target point and axis: a 64-bit hash (splitmix64)."""
-    h = np.uint64(code) * np.uint64(3) + np.uint64(axis) + seed * np.uint64(0x9E3779B97F4A7C15)
+def _jitter(code, seed):
+    """Three fixed numbers in [-0.5, 0.5) for a target point: 21 bits each of a 64-bit hash (splitmix64)."""
+    h = np.uint64(code) + seed * np.uint64(0x9E3779B97F4A7C15)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     h = h ^ (h >> np.uint64(31))
-    return float(h >> np.uint64(11)) / 9007199254740992.0 - 0.5
+    low, unit = np.uint64(0x1FFFFF), 1.0 / 2097152.0
+    return (
+        np.int64(h & low) * unit - 0.5,
+        np.int64((h >> np.uint64(21)) & low) * unit - 0.5,
+        np.int64((h >> np.uint64(42)) & low) * unit - 0.5,
+    )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -222,7 +226,7 @@ def _nearest(table, bricks, voxels, seed, codes):
         x, y, z = voxels[n, 0], voxels[n, 1], voxels[n, 2]
         cx, cy, cz = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
         for ring in range(SEARCH + 1):
-            # points of farther rings are farther than ring - 1: a voxel's points lie up to half a voxel from its centre
+            # points of this ring and of farther ones are farther than ring - 1
             if ring > 1 and distances[count - 1] <= (ring - 1.0) ** 2:
                 break
             for i in range(cx - ring, cx + ring + 1):
@@ -238,11 +242,17 @@ def _nearest(table, bricks, voxels, seed, codes):
                         if row < 0:
                             continue
                         held = bricks[row, i & 15, j & 15, k & 15]
+                        if held == 0:
+                            continue
+                        # a voxel's points lie up to half a voxel from its centre
+                        ox, oy, oz = abs(i - x) - 0.5, abs(j - y) - 0.5, abs(k - z) - 0.5
+                        ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
+                        if ox * ox + oy * oy + oz * oz >= distances[count - 1]:
+                            continue
                         for point in range(held):
                             code = ((np.int64(row) * 4096 + (i & 15) * 256 + (j & 15) * 16 + (k & 15)) << 3) + point
-                            dx = i + _jitter(code, seed, 0) - x
-                            dy = j + _jitter(code, seed, 1) - y
-                            dz = k + _jitter(code, seed, 2) - z
+                            u, v, w = _jitter(code, seed)
+                            dx, dy, dz = i + u - x, j + v - y, k + w - z
                             d = dx * dx + dy * dy + dz * dz
                             if d >= distances[count - 1]:
                                 continue
@@ -260,6 +270,7 @@ def _places(codes, index, seed, targets):
     for n in numba.prange(len(codes)):
         voxel = (codes[n] >> 3) & 4095
         row = codes[n] >> 15
-        targets[n, 0] = 16 * index[row, 0] + (voxel >> 8) + _jitter(codes[n], seed, 0)
-        targets[n, 1] = 16 * index[row, 1] + ((voxel >> 4) & 15) + _jitter(codes[n], seed, 1)
-        targets[n, 2] = 16 * index[row, 2] + (voxel & 15) + _jitter(codes[n], seed, 2)
+        u, v, w = _jitter(codes[n], seed)
+        targets[n, 0] = 16 * index[row, 0] + (voxel >> 8) + u
+        targets[n, 1] = 16 * index[row, 1] + ((voxel >> 4) & 15) + v
+        targets[n, 2] = 16 * index[row, 2] + (voxel & 15) + w

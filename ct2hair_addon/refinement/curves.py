@@ -6,7 +6,6 @@ import numba
 import numpy as np
 
 from ..strands import Strands, _resample, offsets_from_counts
-from ..volume import BrickVolume
 from .splat import cubic
 
 TURN_PER_SEGMENT = 0.6
@@ -27,31 +26,12 @@ EASED_LEAST, EASED_MOST = 4.0, 10.0
 """voxel; the longest such length, and the shortest: hair that turns within less is a curl, and left as it was traced."""
 EASED_BY = 0.5
 """voxel; easing moves a strand by no more than this, root mean square: as far as traces are off."""
-APART = 1.5
-"""Strands that share a voxel, up to which each is traced by itself; amid more, traces hop from one to the next."""
-MOST_CROWDED = 3.0
 
 
-def crowding(strands: Strands, density: BrickVolume, peak: float) -> np.ndarray:
-    """(N,) float64, 1 to MOST_CROWDED: how many times as many strands as can be told apart share the voxels along each strand.
-
-    strands: mm, in the frame of `density`, the scan less air. peak: of a lone strand there.
-    """
-    even = strands.resampled_by_step(2.0 * density.spacing)
-    along = np.bincount(even.strand_index, density.sample(even.points), len(even)) / np.maximum(even.counts, 1)
-    return np.clip(along / (APART * max(peak, 1e-30)), 1.0, MOST_CROWDED)
-
-
-def mean_curvature(strands: Strands, voxel: float, crowded: np.ndarray | float = 1.0) -> np.ndarray:
-    """(N,) float64, 1/mm: how much each strand (mm) turns a length, waves of a few voxels left out; longer ones, too, where
-    `crowded` (N,), as `crowding` gives it, is over 1. voxel: mm."""
-    wide = np.broadcast_to(np.asarray(crowded) > 1.0, len(strands))
-    turning = np.empty(len(strands))
-    for some, step in ((~wide, BEND_STEP), (wide, MOST_CROWDED * BEND_STEP)):
-        if some.any():
-            even = strands.select(some).resampled_by_step(step * voxel)
-            turning[some] = _turning(even.points, even.offsets)
-    return turning / np.maximum(strands.lengths(), 1e-6)
+def mean_curvature(strands: Strands, voxel: float) -> np.ndarray:
+    """(N,) float64, 1/mm: how much each strand (mm) turns a length, waves of a few voxels left out. voxel: mm."""
+    even = strands.resampled_by_step(BEND_STEP * voxel)
+    return _turning(even.points, even.offsets) / np.maximum(strands.lengths(), 1e-6)
 
 
 def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -62,29 +42,21 @@ def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return lengths
 
 
-def easing_lengths(curvature: np.ndarray, voxel: float, crowded: np.ndarray | float = 1.0) -> np.ndarray:
+def easing_lengths(curvature: np.ndarray, voxel: float) -> np.ndarray:
     """(N,) float64, mm: below which waves of strands of `mean_curvature` (N,), 1/mm, are noise of tracing; 0 for curls. voxel:
-    mm. crowded: as `crowding` gives it."""
-    length = crowded * np.minimum(EASED_TURN / np.maximum(curvature, 1e-6), EASED_MOST * voxel)
+    mm."""
+    length = np.minimum(EASED_TURN / np.maximum(curvature, 1e-6), EASED_MOST * voxel)
     return np.where(length < EASED_LEAST * voxel, 0.0, length)
 
 
-def eased(
-    points: np.ndarray, offsets: np.ndarray, lengths: np.ndarray, voxel: float, crowded: np.ndarray | float = 1.0
-) -> np.ndarray:
+def eased(points: np.ndarray, offsets: np.ndarray, lengths: np.ndarray, voxel: float) -> np.ndarray:
     """(M, 3) float64: evenly spaced points of strands, mm, without waves shorter than `lengths` (N,) mm: the least change of
-    bend along each strand (third differences) within `EASED_BY` times `crowded` (N,) of where it was; roots stay."""
+    bend along each strand (third differences) within `EASED_BY` of where it was; roots stay."""
     counts = np.diff(offsets)
     index = np.repeat(np.arange(len(counts)), counts)
     steps = np.bincount(index, segment_lengths(points, offsets), len(counts)) / np.maximum(counts - 1, 1)
     out = np.array(points, np.float64)
-    _ease(
-        np.asarray(points, np.float64),
-        offsets,
-        lengths / np.maximum(steps, 1e-6),
-        np.full(len(counts), EASED_BY * voxel) * crowded,
-        out,
-    )
+    _ease(np.asarray(points, np.float64), offsets, lengths / np.maximum(steps, 1e-6), EASED_BY * voxel, out)
     return out
 
 
@@ -160,7 +132,7 @@ BAND = 3
 @numba.njit(cache=True, parallel=True)
 def _ease(points, offsets, length, most, out):
     """Per strand the x of least |x - p|^2 + length^6 |third differences of x|^2, with `length` (N,), in points, shortened
-    until the root mean square of x - p is at most `most` (N,); into `out`, which holds p."""
+    until the root mean square of x - p is at most `most`; into `out`, which holds p."""
     for n in numba.prange(len(offsets) - 1):
         start, size = offsets[n], offsets[n + 1] - offsets[n]
         reach = length[n]
@@ -181,7 +153,7 @@ def _ease(points, offsets, length, most, out):
             for i in range(size):
                 for axis in range(3):
                     square += (right[i, axis] - points[start + i, axis]) ** 2
-            if square <= most[n] * most[n] * size:
+            if square <= most * most * size:
                 out[start + 1 : start + size] = right[1:]
                 break
             reach *= 0.8

@@ -16,7 +16,7 @@ from ..strands import Strands
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
-from .curves import crowding, eased, easing_lengths, mean_curvature, segment_lengths
+from .curves import eased, easing_lengths, mean_curvature, segment_lengths
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -78,11 +78,9 @@ def fit_to_volume(
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
     points = np.array(points, np.float64)
-    strands = Strands(points.astype(np.float32), offsets)
-    crowded = crowding(strands, density, profile.peak)
-    curvature = mean_curvature(strands, density.spacing, crowded)
+    curvature = mean_curvature(Strands(points.astype(np.float32), offsets), density.spacing)
     bends = STIFF_TURN / np.maximum(curvature, 1e-6)
-    noise = easing_lengths(curvature, density.spacing, crowded)
+    noise = easing_lengths(curvature, density.spacing)
     rest_lengths = segment_lengths(points, offsets)
     levels = pyramid(density, profile.blur, settings.coarsest)
     plan = shares(settings.iterations, len(levels))

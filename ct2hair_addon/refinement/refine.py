@@ -13,7 +13,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import control_points, crowding, eased, easing_lengths, mean_curvature, polylines
+from .curves import control_points, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
@@ -65,9 +65,7 @@ def refine(
     tally["pieces of lone strands measured"] = profile.pieces
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
-    # the eased strands are as long as the voxels that they run through: not kept
-    eases = settings.iterations and settings.method == "volume"
-    points, offsets = control_points(_eased(kept, density, profile) if eases else kept, settings.points)
+    points, offsets = control_points(kept, settings.points)
     given = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
@@ -100,16 +98,6 @@ def refine(
     result = _supported(Strands(cleared, fine_offsets, kept.strand_attributes), density, hair_level)
     progress(1.0, 1.0)
     return Refined(result, tally, {"before": before, "after": after})
-
-
-def _eased(strands: Strands, density: BrickVolume, profile: StrandProfile) -> Strands:
-    """The strands, points a voxel apart, without the noise of tracing; curls as they were traced."""
-    voxel = density.spacing
-    crowded = crowding(strands, density, profile.peak)
-    lengths = easing_lengths(mean_curvature(strands, voxel, crowded), voxel, crowded)
-    even = strands.resampled_by_step(voxel)
-    points = eased(even.points, even.offsets, lengths, voxel, crowded)
-    return Strands(points.astype(np.float32), even.offsets)
 
 
 def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):

@@ -42,9 +42,11 @@ def test_nearest_targets_are_what_a_search_tree_finds():
     _, everything = chamfer.nearest_targets(bins, voxels.astype(float), 64, 3)
     assert len(everything) == counts.sum()
     assert np.abs(everything - np.rint(everything)).max() <= 0.5
-    distance, _ = cKDTree(everything).query(points, k=8)
+    distance, nearest = cKDTree(everything).query(points, k=8)
     assert (found >= 0).all()
-    np.testing.assert_allclose(np.linalg.norm(targets[found] - points[:, None], axis=2), distance, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(targets[found] - points, axis=1), distance[:, 0], atol=1e-9)
+    together = everything[np.unique(nearest)]
+    np.testing.assert_allclose(targets[np.lexsort(targets.T)], together[np.lexsort(together.T)], atol=1e-9)
     # another seed jitters them elsewhere within their voxels
     _, others = chamfer.nearest_targets(bins, points, 8, 4)
     assert not np.array_equal(np.sort(others, axis=0)[:50], np.sort(targets, axis=0)[:50])
@@ -66,8 +68,8 @@ def loss_of(strands, density):
     points = density.to_voxel(strands.resampled(64).reshape(-1, 3))
     points = points[np.linalg.norm(density.to_scan(points), axis=1) > 43.0]
     found, targets = chamfer.nearest_targets(bins, points, 1, 0)
-    reached = found[:, 0] >= 0
-    apart = np.linalg.norm(targets[found[reached, 0]] - points[reached], axis=1)
+    reached = found >= 0
+    apart = np.linalg.norm(targets[found[reached]] - points[reached], axis=1)
     return float(np.concatenate([apart**2, np.full((~reached).sum(), chamfer.SEARCH**2)]).mean())
 
 

@@ -1,6 +1,7 @@
 """Chamfer targets: the nearest points of the scan, exactly, near and far; bins by density."""
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from ct2hair_addon.refinement.chamfer import BINS, SEARCH, density_bins, nearest_targets
@@ -33,7 +34,18 @@ def test_the_nearest_are_those_of_a_tree_however_far():
     assert np.isin(partial.round(9).view("f8,f8,f8").ravel(), targets.view("f8,f8,f8").ravel()).all()
     expected = cKDTree(targets).query(points, k=16)[0]
     for n in range(len(points)):
-        ours = np.linalg.norm(partial[found[n][found[n] >= 0]] - points[n], axis=1)
+        alone = np.linalg.norm(nearest_targets(bins, points[n : n + 1], 16, 7)[1] - points[n], axis=1)
         near = expected[n][expected[n] < SEARCH - 1.0]
-        np.testing.assert_allclose(ours[: len(near)], near, atol=1e-9)
-    assert (found >= 0).any(axis=1).mean() > 0.9
+        np.testing.assert_allclose(np.sort(alone)[: len(near)], near, atol=1e-9)
+        if len(near):
+            assert np.linalg.norm(partial[found[n]] - points[n]) == pytest.approx(near[0], abs=1e-9)
+    assert (found >= 0).mean() > 0.9
+
+
+def test_where_no_hair_is_near_nothing_is_found():
+    values = np.zeros((48, 48, 48), np.float32)
+    values[40, 40, 40] = 50.0
+    bins = density_bins(BrickVolume.from_dense(values, 0.5), 5.0)
+    found, partial = nearest_targets(bins, np.array([[5.0, 5.0, 5.0], [39.0, 40.0, 41.0]]), 16, 0)
+    assert found[0] == -1 and found[1] >= 0
+    assert abs(partial - 40.0).max() <= 0.5

@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ct2hair_addon.evaluation import render_density, strand_peak
 from ct2hair_addon.refinement.curves import (
     EASED_BY,
-    MOST_CROWDED,
     _solve_bands,
-    crowding,
     eased,
     easing_lengths,
     mean_curvature,
@@ -85,24 +82,3 @@ def test_each_strand_is_eased_by_itself():
     for n, length in enumerate((3.0, 2.0)):
         np.testing.assert_allclose(together[300 * n : 300 * (n + 1)], ease(two[n], length), atol=1e-9)
     assert segment_lengths(together, offsets)[[299, 599]].tolist() == [0.0, 0.0]
-
-
-def test_crowding_counts_the_strands_in_a_voxel():
-    along = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 30.0], 60, dtype=np.float32)
-    for together, expected in ((1, 1.0), (3, 2.0), (40, MOST_CROWDED)):
-        strands = Strands.from_array(np.repeat(along[None], together, axis=0))
-        found = crowding(strands, render_density(strands, VOXEL, 0.85), strand_peak(0.85))
-        np.testing.assert_allclose(found, expected, rtol=0.12)
-
-
-def test_amid_many_strands_hops_are_eased_and_longer_ones_than_else():
-    clean = arc(70.0, length=200.0)
-    hops = clean + np.cumsum(np.random.default_rng(4).normal(size=(len(clean), 3)), axis=0) * 0.05
-    strands, crowded = one(hops), np.array([MOST_CROWDED])
-    alone = eased(hops, strands.offsets, easing_lengths(mean_curvature(strands, VOXEL), VOXEL), VOXEL)
-    amid = eased(hops, strands.offsets, easing_lengths(mean_curvature(strands, VOXEL, crowded), VOXEL, crowded), VOXEL, crowded)
-    true = mean_curvature(one(clean), VOXEL)[0]
-    assert abs(mean_curvature(strands, VOXEL, crowded)[0] - true) < 0.5 * abs(mean_curvature(strands, VOXEL)[0] - true)
-    assert mean_curvature(one(amid), VOXEL)[0] - true < 0.6 * (mean_curvature(one(alone), VOXEL)[0] - true)
-    moved = np.sqrt(((amid - hops) ** 2).sum(axis=1).mean())
-    assert moved <= EASED_BY * MOST_CROWDED * VOXEL
