@@ -10,13 +10,14 @@ from .splat import cubic
 
 TURN_PER_SEGMENT = 0.6
 """Radians that one cubic segment may turn: it then stays within 0.3 % of the radius of an arc."""
-SEGMENT_LENGTH = 6.0
-"""Longest segment of a straight strand, mm: bends shorter than a few of these are noise of the scan."""
+SEGMENT_LENGTH = 3.0
+"""Longest segment of a straight strand, mm: hair bends within less than two of these where it leaves the scalp."""
 LEAST_POINTS = 8
 TURN_PER_EDGE = 0.25
+"""Radians that an output polyline turns at a point, where 16 to 128 points allow."""
+LONGEST_EDGE = 8.0
+"""mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
-"""An output polyline turns at most 0.25 radian at a point where 16 to 128 points allow."""
-
 
 BEND_STEP = 8.0
 """voxel; turning is measured over so much: shorter waves are noise of the tracing."""
@@ -70,41 +71,82 @@ def control_points(strands: Strands, most: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def polylines(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 3) float32 points on the cubics and (N + 1,) offsets: 16 to 128 points a strand, as it turns."""
-    counts = np.diff(offsets)
-    turning = _turning(points.astype(np.float32), offsets)
-    edges = np.clip(np.ceil(turning / TURN_PER_EDGE).astype(np.int64), LEAST_EDGES, MOST_EDGES)
-    edges = np.maximum(edges, np.minimum(counts - 1, MOST_EDGES))
-    return _evaluate(points, offsets, offsets_from_counts(edges + 1))
-
-
-def _evaluate(points: np.ndarray, offsets: np.ndarray, out_offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 3) float32 points on the cubics and (N + 1,) offsets: 16 to 128 points a strand, closer where it turns."""
+    wanted = _edges_wanted(points, offsets)
+    counts = np.clip(np.ceil(wanted[offsets[1:] - 1]).astype(np.int64), LEAST_EDGES, MOST_EDGES) + 1
+    out_offsets = offsets_from_counts(counts)
     out = np.empty((out_offsets[-1], 3), np.float32)
-    _evaluate_cubics(points, offsets, out_offsets, out)
+    _evaluate_cubics(points, offsets, wanted, out_offsets, out)
     return out, out_offsets
 
 
 @numba.njit(cache=True, parallel=True)
-def _evaluate_cubics(points, offsets, out_offsets, out):
+def _edges_wanted(points, offsets):
+    """(M,) float64: how many edges a strand wants from its root to each control point, by length and by turning."""
+    wanted = np.zeros(len(points))
+    for n in numba.prange(len(offsets) - 1):
+        start, end = offsets[n], offsets[n + 1]
+        segments = end - start - 1
+        if segments < 1:
+            continue
+        own = np.zeros(segments)
+        for m in range(start, end - 1):
+            length = 0.0
+            for axis in range(3):
+                length += (points[m + 1, axis] - points[m, axis]) ** 2
+            own[m - start] = np.sqrt(length) / LONGEST_EDGE + 1e-9
+        for m in range(start + 1, end - 1):
+            turn = _turn(points, m) / TURN_PER_EDGE
+            own[m - start - 1] += 0.5 * turn
+            own[m - start] += 0.5 * turn
+        # Neighbours share, so that the spacing changes by degrees.
+        total = 0.0
+        for i in range(segments):
+            total += 0.25 * own[max(i - 1, 0)] + 0.5 * own[i] + 0.25 * own[min(i + 1, segments - 1)]
+            wanted[start + i + 1] = total
+    return wanted
+
+
+@numba.njit(cache=True, parallel=True)
+def _evaluate_cubics(points, offsets, wanted, out_offsets, out):
+    """Points of the cubics at even shares of `wanted` (M,), rising along each strand; its ends exactly."""
     for n in numba.prange(len(offsets) - 1):
         start, end = offsets[n], offsets[n + 1]
         first, count = out_offsets[n], out_offsets[n + 1] - out_offsets[n]
-        for s in range(count):
-            place = s / (count - 1) * (end - start - 1)
-            i = min(int(place), max(end - start - 2, 0))
-            m = start + i
-            if end - start < 2:
+        if end - start < 2:
+            for s in range(count):
                 for axis in range(3):
-                    out[first + s, axis] = points[m, axis]
-                continue
-            at_start, at_end = m == start, m + 2 >= end
+                    out[first + s, axis] = points[start, axis]
+            continue
+        m = start
+        for s in range(count):
+            place = s / (count - 1) * wanted[end - 1]
+            while m + 2 < end and wanted[m + 1] < place:
+                m += 1
+            t = min(max((place - wanted[m]) / (wanted[m + 1] - wanted[m]), 0.0), 1.0)
+            at_start, at_end = m == start, m + 2 == end
             p0 = m if at_start else m - 1
             p3 = m + 1 if at_end else m + 2
-            a, b, c, d = cubic(place - i, at_start, at_end)
+            a, b, c, d = cubic(t, at_start, at_end)
             for axis in range(3):
                 out[first + s, axis] = (
                     a * points[p0, axis] + b * points[m, axis] + c * points[m + 1, axis] + d * points[p3, axis]
                 )
+
+
+@numba.njit(cache=True, inline="always")
+def _turn(points, m):
+    """The angle, radians, that a polyline turns through at its inner point m."""
+    dot, before, after = 0.0, 0.0, 0.0
+    for axis in range(3):
+        u = points[m, axis] - points[m - 1, axis]
+        v = points[m + 1, axis] - points[m, axis]
+        dot += u * v
+        before += u * u
+        after += v * v
+    if before == 0.0 or after == 0.0:
+        return 0.0
+    return np.arccos(min(max(dot / np.sqrt(before * after), -1.0), 1.0))
 
 
 @numba.njit(cache=True, parallel=True)
@@ -113,15 +155,7 @@ def _turning(points, offsets):
     turning = np.zeros(len(offsets) - 1)
     for n in numba.prange(len(offsets) - 1):
         for m in range(offsets[n] + 1, offsets[n + 1] - 1):
-            dot, before, after = 0.0, 0.0, 0.0
-            for axis in range(3):
-                u = points[m, axis] - points[m - 1, axis]
-                v = points[m + 1, axis] - points[m, axis]
-                dot += u * v
-                before += u * u
-                after += v * v
-            if before > 0.0 and after > 0.0:
-                turning[n] += np.arccos(min(max(dot / np.sqrt(before * after), -1.0), 1.0))
+            turning[n] += _turn(points, m)
     return turning
 
 

@@ -29,7 +29,7 @@ FRICTION = 0.5
 """Share of a Newton step that is taken, and of the last step that goes on: together just short of overshooting."""
 STEP_LIMIT = 0.5
 """Longest move in one iteration, voxels: within the reach of the potential that it follows."""
-LENGTH_SWEEPS = 4
+LENGTH_SWEEPS = 6
 STIFF_TURN = 0.075
 """Radians that a strand turns over the length that its shape is kept below."""
 SMOOTH_HAIR = 2.0
