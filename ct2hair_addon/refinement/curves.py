@@ -35,6 +35,11 @@ def mean_curvature(strands: Strands, voxel: float) -> np.ndarray:
     return _turning(even.points, even.offsets) / np.maximum(strands.lengths(), 1e-6)
 
 
+def local_curvature(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(M,) float64, 1/mm: how much strands turn a length around each control point (mm), two to either side counted as well."""
+    return _local_curvature(points, offsets)
+
+
 def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """(M,) the distance from each point to the next of its strand; 0 at tips."""
     lengths = np.zeros(len(points))
@@ -132,6 +137,33 @@ def _evaluate_cubics(points, offsets, wanted, out_offsets, out):
                 out[first + s, axis] = (
                     a * points[p0, axis] + b * points[m, axis] + c * points[m + 1, axis] + d * points[p3, axis]
                 )
+
+
+@numba.njit(cache=True, parallel=True)
+def _local_curvature(points, offsets):
+    out = np.zeros(len(points))
+    for n in numba.prange(len(offsets) - 1):
+        start, end = offsets[n], offsets[n + 1]
+        if end - start < 3:
+            continue
+        turns = np.zeros(end - start)
+        length = 0.0
+        for m in range(start + 1, end):
+            length += np.sqrt(
+                (points[m, 0] - points[m - 1, 0]) ** 2
+                + (points[m, 1] - points[m - 1, 1]) ** 2
+                + (points[m, 2] - points[m - 1, 2]) ** 2
+            )
+            if m + 1 < end:
+                turns[m - start] = _turn(points, m)
+        step = max(length / (end - start - 1), 1e-9)
+        for i in range(end - start):
+            total = weight = 0.0
+            for k in range(max(i - 2, 1), min(i + 3, end - start - 1)):
+                w = 3.0 - abs(k - i)
+                total, weight = total + w * turns[k], weight + w
+            out[start + i] = total / weight / step
+    return out
 
 
 @numba.njit(cache=True, inline="always")

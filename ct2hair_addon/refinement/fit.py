@@ -16,7 +16,7 @@ from ..strands import Strands
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
-from .curves import eased, easing_lengths, mean_curvature, segment_lengths
+from .curves import eased, easing_lengths, local_curvature, mean_curvature, segment_lengths
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -33,7 +33,7 @@ LENGTH_SWEEPS = 6
 STIFF_TURN = 0.075
 """Radians that a strand turns over the length that its shape is kept below."""
 SMOOTH_HAIR = 2.0
-"""How much longer than `stiffness` that length may be where hair bends little: its short waves are noise and hops."""
+"""How much longer than `stiffness` that length may be where hair bends little: short waves are noise and hops there."""
 PLANES_EVERY = 10
 """Iterations after which the head's tangent planes are taken anew; a point moves a few voxels at most in between."""
 
@@ -79,7 +79,7 @@ def fit_to_volume(
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
     points = np.array(points, np.float64)
     curvature = mean_curvature(Strands(points.astype(np.float32), offsets), density.spacing)
-    bends = STIFF_TURN / np.maximum(curvature, 1e-6)
+    bends = STIFF_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
     noise = easing_lengths(curvature, density.spacing)
     rest_lengths = segment_lengths(points, offsets)
     levels = pyramid(density, profile.blur, settings.coarsest)

@@ -94,8 +94,8 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
     """One step of every strand towards the minimum of data + bending of the displacement from `rest`; roots stay.
 
     Solves, per strand and axis, (w + a K) d = rate * w * force - a K (points - rest), K = D2' D2 (second differences),
-    a = (stiffness / segment length)^4; then velocity = friction * velocity + d, cut to `limit`, moves the points.
-    stiffness (N,), limit and lengths in the unit of `points`.
+    a = (stiffness / segment length)^4 at each point; then velocity = friction * velocity + d, cut to `limit`, moves the points.
+    stiffness (M,), limit and lengths in the unit of `points`.
     """
     for n in numba.prange(len(offsets) - 1):
         start, size = offsets[n], offsets[n + 1] - offsets[n]
@@ -107,8 +107,6 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
                 (rest[m + 1, 0] - rest[m, 0]) ** 2 + (rest[m + 1, 1] - rest[m, 1]) ** 2 + (rest[m + 1, 2] - rest[m, 2]) ** 2
             )
         step = max(length / (size - 1), 1e-6)
-        # A band at most so stiff that float64 still resolves the data beside it.
-        a = min((stiffness[n] / step) ** 4, 1e8)
         diagonal, one, two = np.zeros(size), np.zeros(size), np.zeros(size)
         right = np.zeros((size, 3))
         for i in range(size):
@@ -117,6 +115,8 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
             for axis in range(3):
                 right[i, axis] = rate * w * forces[start + i, axis]
         for i in range(1, size - 1):
+            # A band at most so stiff that float64 still resolves the data beside it.
+            a = min((stiffness[start + i] / step) ** 4, 1e8)
             diagonal[i - 1] += a
             diagonal[i] += 4.0 * a
             diagonal[i + 1] += a

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ct2hair_addon.refinement.boundary import MARGIN, Boundary
-from ct2hair_addon.refinement.curves import _evaluate_cubics, control_points, polylines, segment_lengths
+from ct2hair_addon.refinement.curves import _evaluate_cubics, control_points, local_curvature, polylines, segment_lengths
 from ct2hair_addon.refinement.fit import pyramid, shares
 from ct2hair_addon.refinement.motion import _solve_band, keep_lengths, stiff_step
 from ct2hair_addon.refinement.splat import render
@@ -42,7 +42,7 @@ def stepped(forces, weights=None, stiffness=3.0, limit=100.0, points=None, frict
     points = rest.copy() if points is None else points
     velocity = np.zeros_like(points)
     weights = np.ones(len(points)) if weights is None else weights
-    firm = np.full(len(offsets) - 1, float(stiffness))
+    firm = np.full(len(points), float(stiffness))
     stiff_step(points, rest, offsets, forces, weights, firm, 1.0, friction, limit, velocity)
     return points, rest
 
@@ -188,3 +188,31 @@ def test_the_iterations_are_shared_out_whole(iterations, levels):
     found = shares(iterations, levels)
     assert len(found) == levels and sum(found) == iterations and min(found) >= 0
     assert found[-1] >= iterations // 2
+
+
+def test_a_strand_gives_way_where_it_is_soft():
+    """A single force moves a soft stretch alone, a stiff one with its neighbours."""
+    rest, offsets = line(40)
+    firm = np.where(np.arange(40) < 20, 1.0, 12.0)
+    force = np.zeros((40, 3))
+    moves = []
+    for at in (10, 30):
+        points = rest.copy()
+        force[:] = 0.0
+        force[at, 0] = 0.5
+        stiff_step(points, rest, offsets, force, np.ones(40), firm, 1.0, 0.0, 100.0, np.zeros((40, 3)))
+        moved = points[:, 0] - rest[:, 0]
+        moves.append((moved[at], np.abs(moved[max(at - 5, 0) : at + 6]).sum() / moved[at]))
+    assert moves[0][0] > 2.0 * moves[1][0]
+    assert moves[0][1] < 0.7 * moves[1][1]
+
+
+def test_curvature_is_local():
+    bend = np.linspace(0.0, np.pi / 2, 20)
+    arc = 5.0 * np.stack([1.0 - np.cos(bend), np.sin(bend), 0.0 * bend], axis=1)
+    straight = arc[-1] + np.arange(1.0, 31.0)[:, None] * [0.41, 0.0, 0.0]
+    points = np.concatenate([arc, straight])
+    found = local_curvature(points, np.array([0, len(points)]))
+    np.testing.assert_allclose(found[2:16], 1 / 5.0, rtol=0.02)
+    np.testing.assert_allclose(found[23:], 0.0, atol=1e-6)
+    assert local_curvature(points[:2], np.array([0, 2])).tolist() == [0.0, 0.0]
