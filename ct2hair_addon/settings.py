@@ -177,7 +177,7 @@ class RefinementSettings:
     )
     stiffness: float = parameter(
         2.5,
-        "volume: shape is kept below about six times this length, in tight curls; in smooth hair up to three times as far",
+        "volume: shape is kept below about six times this length where hair bends, and twice as far where it is straight",
         unit="voxel",
         low=0.0,
         high=100.0,
