@@ -26,6 +26,8 @@ LONE_PEAK = 1.0 / (2.0 * np.pi * SCORE_BLUR**2)
 NOISE_BLUR, NOISE_SHARE = 1.0, 0.15
 """A voxel of the scan that passes only by noise has nothing around it: blurred by one more voxel, it falls below this share
 of a lone strand's peak, which the rim of a strand keeps up to 0.25 of."""
+_STRANDS = 2000
+"""Strands looked at together: each has some hundred points."""
 
 
 def scan_agreement(
@@ -85,18 +87,27 @@ def _coarse_grid(sets: list[Strands], density: BrickVolume, scale: float) -> Bri
     """An empty volume of voxels `scale` times the scan's, with bricks wherever the scan or a strand has something."""
     spacing = density.spacing * scale
     edge = BRICK * spacing
-    lows = density.to_scan(BRICK * density.brick_index) - 0.5 * density.spacing
-    found = [lows + BRICK * density.spacing * np.array(corner) for corner in np.ndindex(2, 2, 2)]
     reach = 3.0 * spacing
-    steps = np.concatenate([strands.resampled_by_step(0.25 * edge).points for strands in sets]).astype(np.float64)
-    found += [steps + reach * (2.0 * np.array(corner) - 1.0) for corner in np.ndindex(2, 2, 2)]
-    low = np.min([f.min(axis=0) for f in found if len(f)], axis=0) - spacing
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    lows = density.to_scan(BRICK * density.brick_index) - 0.5 * density.spacing
+    inside = [lows, lows + BRICK * density.spacing]
+    inside += [strands.points + way * reach for strands in sets if len(strands.points) for way in (-1.0, 1.0)]
+    low = np.min([each.min(axis=0) for each in inside if len(each)], axis=0) - spacing
+    high = np.max([each.max(axis=0) for each in inside if len(each)], axis=0)
     origin = density.origin + np.floor((low - density.origin) / edge) * edge
-    cells = [np.floor((f - origin + 0.5 * spacing) / edge).astype(np.int64) for f in found if len(f)]
-    size = np.max([c.max(axis=0) for c in cells], axis=0) + 1
+    size = np.floor((high - origin + 0.5 * spacing) / edge).astype(np.int64) + 1
     kept = np.zeros(tuple(size), bool)
-    for cell in cells:
-        kept[tuple(cell.T)] = True
+
+    def keep(points: np.ndarray) -> None:
+        kept[tuple(np.floor((points - origin + 0.5 * spacing) / edge).astype(np.int64).T)] = True
+
+    for corner in corners:
+        keep(lows + BRICK * density.spacing * corner)
+    for strands in sets:
+        for at in range(0, len(strands), _STRANDS):
+            some = strands.select(np.arange(at, min(at + _STRANDS, len(strands)))).resampled_by_step(0.25 * edge).points
+            for corner in corners:
+                keep(some + reach * (2.0 * corner - 1.0))
     table = np.full(tuple(size), -1, np.int32)
     table[kept] = np.arange(np.count_nonzero(kept), dtype=np.int32)
     bricks = np.empty((np.count_nonzero(kept), BRICK, BRICK, BRICK), np.float32)
