@@ -66,11 +66,14 @@ def eased(points: np.ndarray, offsets: np.ndarray, lengths: np.ndarray, voxel: f
     return out
 
 
-def control_points(strands: Strands, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 3) float64 control points, equally spaced along each strand, and (N + 1,) offsets: more where a strand turns more."""
+def control_points(strands: Strands, most: int, longest: float = SEGMENT_LENGTH) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 3) float64 control points, equally spaced along each strand, and (N + 1,) offsets: more where a strand turns more.
+
+    most: points of a strand; longest: mm between two of them.
+    """
     even = strands.resampled_by_step(1.0)
     turning = _turning(even.points, even.offsets)
-    wanted = np.maximum(strands.lengths() / SEGMENT_LENGTH, turning / TURN_PER_SEGMENT)
+    wanted = np.maximum(strands.lengths() / longest, turning / TURN_PER_SEGMENT)
     counts = np.clip(np.ceil(wanted).astype(np.int64) + 1, min(LEAST_POINTS, most), most)
     return _resample(strands.points, strands.offsets, counts).astype(np.float64), offsets_from_counts(counts)
 

@@ -13,12 +13,15 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import control_points, polylines
+from .curves import SEGMENT_LENGTH, control_points, polylines
 from .fit import fit_to_volume
 from .pruning import prune
 
 MISPLACED = 2.0
 """voxel; strands may be off by so much before they are fitted, and are not held to be wrong for it."""
+CHAMFER_SEGMENT = 6.0
+"""mm between two control points of the paper's fit at most: it holds nothing but lengths and tangents, and follows noise with
+closer ones."""
 SETTLED = 15
 """Iterations after which strands are where they belong."""
 
@@ -65,7 +68,8 @@ def refine(
     tally["pieces of lone strands measured"] = profile.pieces
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
-    points, offsets = control_points(kept, settings.points)
+    longest = CHAMFER_SEGMENT if settings.method == "chamfer" else SEGMENT_LENGTH
+    points, offsets = control_points(kept, settings.points, longest)
     given = (Strands(points, offsets), boundary.look(points))
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
