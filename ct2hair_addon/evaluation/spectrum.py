@@ -35,7 +35,7 @@ def curvature_spectrum(strands: Strands) -> dict[str, float]:
     return {f"{low:g}-{high:g}": float(value) for (low, high), value in zip(BANDS, rms, strict=True)}
 
 
-def band_powers(curvature: np.ndarray, step: float, counts: np.ndarray) -> np.ndarray:
+def band_powers(curvature: np.ndarray, step: float | np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(N, bands) mean squares of (N, P, 3) curvature vectors, 0 from `counts` (N,) on, in each of BANDS.
 
     step: mm between points, one for all or (N,).

@@ -93,7 +93,7 @@ def _coarse_grid(sets: list[Strands], density: BrickVolume, scale: float) -> Bri
     inside = [lows, lows + BRICK * density.spacing]
     inside += [strands.points + way * reach for strands in sets if len(strands.points) for way in (-1.0, 1.0)]
     low = np.min([each.min(axis=0) for each in inside if len(each)], axis=0) - spacing
-    high = np.max([each.max(axis=0) for each in inside if len(each)], axis=0)
+    high = np.max([each.max(axis=0) for each in inside if len(each)], axis=0) + spacing
     origin = density.origin + np.floor((low - density.origin) / edge) * edge
     size = np.floor((high - origin + 0.5 * spacing) / edge).astype(np.int64) + 1
     kept = np.zeros(tuple(size), bool)

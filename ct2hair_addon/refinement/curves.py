@@ -35,11 +35,6 @@ def mean_curvature(strands: Strands, voxel: float) -> np.ndarray:
     return _turning(even.points, even.offsets) / np.maximum(strands.lengths(), 1e-6)
 
 
-def local_curvature(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(M,) float64, 1/mm: how much strands turn a length around each control point (mm), two to either side counted as well."""
-    return _local_curvature(points, offsets)
-
-
 def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """(M,) the distance from each point to the next of its strand; 0 at tips."""
     lengths = np.zeros(len(points))
@@ -143,7 +138,8 @@ def _evaluate_cubics(points, offsets, wanted, out_offsets, out):
 
 
 @numba.njit(cache=True, parallel=True)
-def _local_curvature(points, offsets):
+def local_curvature(points, offsets):
+    """(M,) float64, 1/mm: how much strands turn a length around each control point (mm), two to either side counted as well."""
     out = np.zeros(len(points))
     for n in numba.prange(len(offsets) - 1):
         start, end = offsets[n], offsets[n + 1]
