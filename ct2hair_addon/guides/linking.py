@@ -50,8 +50,8 @@ KINK_SPAN = 10
 PER_VOXEL = 0.5
 UNBACKED = 6.0
 """Cost of a voxel of gap, and of a gap that the scan does not back at all."""
-PER_CUT = 0.02
-"""Cost of a voxel that is cut off a trace."""
+PER_CUT = 0.1
+"""Cost of a voxel that is cut off a trace: where it was dearer to bend than to cut, a tenth of all hair was cut away."""
 LOOSE_END = 30.0
 """Cost of a tip that goes on nowhere: joints dearer than this are not made."""
 STEP = 1.0

@@ -12,9 +12,9 @@ from ..progress import Progress, part, silent
 from ..settings import GuideSettings
 from ..strands import Strands
 from ..volume.grid import BrickVolume
-from ..volume.strand_signal import StrandProfile
+from ..volume.strand_signal import StrandProfile, data_floor
 from .direction import fine_ends, signs
-from .growing import grow_to_root, lead_into_scalp, push_out
+from .growing import follow_to_scalp, grow_to_root, lead_into_scalp, push_out
 from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
 from .profile import strand_profile
@@ -23,6 +23,8 @@ from .trace import trace_segments
 
 PROFILED = 8000
 """Candidates that the strand's profile is measured on."""
+SHOWN = 2.0
+"""voxel; hair is traced down to about this far over what was cleared with the net."""
 COARSEST = 1.0
 """mm; points of a guide are at most this far apart, or two voxels where that is less."""
 
@@ -92,10 +94,10 @@ def trace_guides(
 ) -> Guides:
     """Guide strands of the hair in `density` (air at 0, hair above `hair_level`) on `head`.
 
-    Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, the poor ones
-    grown along rooted neighbours, each root led into the scalp, to a knot (`knots` (K, 3), mm) where there is one by it, no
-    point left inside the head. With `settings.method` "paper" all of it goes the
-    paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
+    Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, those that begin
+    over the scalp followed back through the hair to it or grown along rooted neighbours, each root led into the scalp, to a
+    knot (`knots` (K, 3), mm) where there is one by it, no point left inside the head. With `settings.method` "paper" all of it
+    goes the paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
     seeds = seed_voxels(field.confidence, field.direction, seed)
@@ -106,8 +108,9 @@ def trace_guides(
     del field  # as large as the density in float32: its memory is free from here on if the caller, too, has let go of it
     segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85))
     del seeds, way
+    floor = data_floor(density, hair_level, head)
     strands, more = root_segments(
-        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), scan=density, strand=profile.seen, knots=knots
+        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), density, profile.seen, knots, floor
     )
     progress(1, 1)
     return Guides(strands, profile, tally | more)
@@ -122,11 +125,12 @@ def root_segments(
     scan: BrickVolume | None = None,
     strand: float = 0.0,
     knots: np.ndarray | None = None,
+    floor: float = 0.0,
 ) -> tuple[Strands, dict[str, int]]:
     """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; and what became of them.
 
     scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
-    knots: (K, 3) mm, where strands are tied to the net.
+    knots: (K, 3) mm, where strands are tied to the net. floor: mm over the scalp below which the scan shows no hair.
     """
     tally: dict[str, int] = {}
     fine = fine_ends(segments, head, settings)
@@ -147,7 +151,12 @@ def root_segments(
         directed, rooted, bridged = segments.reversed(value < 0), fine != 0, np.zeros(len(segments), np.float32)
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
     traced = directed.lengths() - bridged
-    bodies, reached, grown = grow_to_root(directed.resampled_by_step(_step(spacing)), rooted, settings)
+    bodies, low, walked = follow_to_scalp(
+        directed.resampled_by_step(_step(spacing)), head, floor + SHOWN * spacing, part(progress, 0.5, 0.6)
+    )
+    tally["followed back through the hair"] = int((walked > 0).sum())
+    bodies, reached, grown = grow_to_root(bodies, rooted | low, settings)
+    grown += walked
     progress(0.7, 1.0)
     tally["dropped: no rooted hair near"] = int((~reached).sum())
     backed = traced / np.maximum(traced + bridged + grown, 1e-6)

@@ -19,9 +19,10 @@ surface of radius R, 0.01 mm on a scalp."""
 BRICKS_A_CALL = 1024
 """Bricks of one kernel call: well under a second."""
 
-NET_HEIGHT, NET_BLUR = 0.5, 1.5
-"""mm, and voxel: how high a net's threads lie over the scalp, and how far the scan's blur carries them (1.8 sigma)."""
-CLEARANCES = (0.8, 1.5)
+NET_HEIGHT, NET_BLUR = 0.5, 1.1
+"""mm, and voxel: how high a net's threads lie over the scalp, and how far the scan's blur carries them and the knots (1.3
+sigma). More hides hair that lies flat; less shows so much of the knots that strands are led from one to the next."""
+CLEARANCES = (0.6, 1.5)
 """mm; the least and the most that is cleared where the settings give no number."""
 
 

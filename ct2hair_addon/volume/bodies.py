@@ -17,8 +17,8 @@ from .thresholds import SOLID_VOLUME
 
 FLAT_REACH = 3
 """Dense voxels up to so far from a flat one belong to the body: its rims, and the skin under knots."""
-CLEAR = 3
-"""Voxels around a body that are cleared with it: its blurred edge."""
+CLEAR = 2
+"""Voxels around a body that are cleared with it: its blurred edge, of which a tenth of a lone strand is left there."""
 CELL = 4
 """Voxels of a cell in which bodies are told apart."""
 MOST_SOLID = 200_000

@@ -11,6 +11,7 @@ from ct2hair_addon.head import Head
 from ct2hair_addon.strands import Strands
 
 BEHIND = 1.1
+HIDDEN = 1.5
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def tied_hair(ball):
 
 def test_roots_go_to_their_own_knots(ball, tied_hair):
     knots, found, forward = tied_hair
-    roots, tied = tie_to_knots(found, forward, ball, knots)
+    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots)
     assert tied.mean() > 0.98
     off = np.linalg.norm(roots - knots, axis=1)
     assert np.mean(off < 0.05) > 0.93, "most should find the knot that they were drawn from"
@@ -52,17 +53,31 @@ def test_roots_go_to_their_own_knots(ball, tied_hair):
 def test_roots_without_a_knot_take_what_the_others_missed(ball, tied_hair):
     knots, found, forward = tied_hair
     seen = np.random.default_rng(1).permutation(len(knots))[: int(0.6 * len(knots))]
-    roots, tied = tie_to_knots(found, forward, ball, knots[seen])
+    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots[seen])
     alone = ~tied
     assert 0.2 < alone.mean() < 0.5
     before, after = (np.median(np.linalg.norm(some[alone] - knots[alone], axis=1)) for some in (found.position, roots))
     assert after < 0.6 * before
 
 
+def test_hair_that_is_hidden_for_long_may_come_from_farther_back(ball, tied_hair):
+    knots, found, forward = tied_hair
+    normal = found.normal.astype(float)
+    along = forward - normal * (forward * normal).sum(axis=1, keepdims=True)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    few = np.arange(0, len(knots), 25)  # far from one another
+    far = ball.closest_scalp(knots[few] - 7.0 * along[few])
+    roots, tied = tie_to_knots(far, forward[few], np.full(len(few), 12.0), ball, knots[few])
+    assert tied.mean() > 0.9
+    np.testing.assert_allclose(roots[tied], knots[few][tied])
+    roots, tied = tie_to_knots(far, forward[few], np.full(len(few), HIDDEN), ball, knots[few])
+    assert np.mean(np.linalg.norm(roots - knots[few], axis=1) < 0.05) < 0.1
+
+
 @pytest.mark.parametrize("knots", [np.zeros((0, 3)), np.full((5, 3), 400.0)])
 def test_without_knots_by_the_scalp_nothing_moves(knots, ball, tied_hair):
     _, found, forward = tied_hair
-    roots, tied = tie_to_knots(found, forward, ball, knots)
+    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots)
     np.testing.assert_array_equal(roots, found.position)
     assert not tied.any()
 

@@ -5,7 +5,7 @@ import pytest
 
 from ct2hair_addon.guides import root_segments
 from ct2hair_addon.guides.direction import fine_ends, signs
-from ct2hair_addon.guides.growing import grow_to_root, lead_into_scalp, push_out
+from ct2hair_addon.guides.growing import follow_to_scalp, grow_to_root, lead_into_scalp, push_out
 from ct2hair_addon.head import Head, HeadMesh
 from ct2hair_addon.settings import GuideSettings
 from ct2hair_addon.strands import Strands
@@ -69,6 +69,33 @@ def test_growing_follows_the_neighbours_in_rounds(ball):
     scalp = ball.closest_scalp(grown.roots[:6])
     assert scalp.distance.max() < 5
     np.testing.assert_array_equal(grown.tips, strands.tips)
+
+
+def lying(azimuth: float, start: float, end: float, over=0.0) -> np.ndarray:
+    """A stretch of hair that lies on the ball from near its top down, and rises by 1 mm in 20."""
+    s = np.arange(start, end, 0.5)
+    polar, radius = 0.3 + s / RADIUS, RADIUS + 1.0 + over + 0.05 * s
+    outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return radius[:, None] * (np.sin(polar)[:, None] * outwards + np.cos(polar)[:, None] * [0, 0, 1.0])
+
+
+def test_hair_that_begins_over_others_is_followed_back_beside_them(ball):
+    lines = [lying(0.03 * n, 0.0, 60.0) for n in range(12)]
+    late = [lying(0.03 * n + 0.015, 40.0, 60.0, over=0.3) for n in range(2, 10, 3)]
+    strands = Strands.from_polylines([*lines, *late])
+    followed, low, walked = follow_to_scalp(strands, ball, 2.0)
+    assert low.all() and (walked[:12] == 0).all()
+    np.testing.assert_allclose(walked[12:], 26.0, atol=4.0)  # from 3.3 mm down to 2
+    np.testing.assert_array_equal(followed.tips, strands.tips)
+    for n, line in enumerate(followed.select(np.arange(12, 15)).polylines()):
+        assert np.degrees(np.arctan2(line[0, 1], line[0, 0])) == pytest.approx(np.degrees(0.03 * (3 * n + 2) + 0.015), abs=1.5)
+
+
+def test_hair_with_none_around_is_not_followed(ball):
+    strands = Strands.from_polylines([hair(0.0, 1.0, 80), hair(2.0, 30.0, 80)])
+    followed, low, walked = follow_to_scalp(strands, ball, 2.0)
+    assert low.tolist() == [True, False] and not walked.any()
+    np.testing.assert_array_equal(followed.points, strands.points)
 
 
 def test_the_lead_starts_on_the_scalp_and_goes_on_smoothly(ball):

@@ -75,10 +75,10 @@ def test_no_clearance_leaves_all_that_is_outside(small, volume):
 
 
 def test_left_at_0_the_clearance_is_what_a_net_takes_in_the_scan(small, volume):
-    assert [clearance(spacing, HeadSettings()) for spacing in (0.1, 0.4, 0.8)] == pytest.approx([0.8, 1.1, 1.5])
+    assert [clearance(spacing, HeadSettings()) for spacing in (0.05, 0.4, 1.2)] == pytest.approx([0.6, 0.94, 1.5])
     assert clearance(0.1, SETTINGS) == CLEARANCE
     automatic, _ = remove_hairnet(volume, small, HeadSettings())
-    by_hand, _ = remove_hairnet(volume, small, HeadSettings(net_clearance=1.5))
+    by_hand, _ = remove_hairnet(volume, small, HeadSettings(net_clearance=0.5 + 1.1 * SPACING))
     np.testing.assert_array_equal(automatic.bricks, by_hand.bricks)
 
 
