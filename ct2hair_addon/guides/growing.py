@@ -11,7 +11,7 @@ from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..strands import Strands, offsets_from_counts
-from .direction import TOUCH, end_tangents
+from .direction import TOUCH, end_tangents, unit
 from .knots import tie_to_knots
 
 REACHES = (1.0, 2.0, 4.0)
@@ -42,7 +42,7 @@ WALK_POINTS, WALK_TURN = 16, 0.3
 WALK_AHEAD = WALK_STEP * ((1.0 - WALK_TURN) / WALK_TURN + 0.5)
 """mm ahead that they are asked at: by so much the way lags behind, and over a curved scalp a lag would lead off it."""
 LONGEST_WALK = 150.0
-"""mm."""
+"""mm that a strand is followed back at most."""
 CLEARANCE = 0.05
 """mm; points inside the head are pushed this far out of it."""
 
@@ -128,8 +128,7 @@ def course_around(strands: Strands, places: np.ndarray, own: np.ndarray) -> np.n
     found = np.isfinite(distance)
     tangents = tangents[np.where(found, near, 0)]
     along = found & (np.einsum("nkc,nc->nk", tangents, own) > 0.0)
-    mean = np.einsum("nkc,nk->nc", tangents, along.astype(np.float64)) / np.maximum(along.sum(axis=1), 1)[:, None]
-    return _unit(_unit(mean) + OWN * own)
+    return unit(unit(np.einsum("nkc,nk->nc", tangents, along.astype(np.float64))) + OWN * own)
 
 
 def follow_to_scalp(
@@ -142,21 +141,40 @@ def follow_to_scalp(
     (N,) bool which are low now, or as low as a root end may be, (N,) float32 mm put before); a strand that does not come
     there stays as it is.
     """
-    height = head.signed_distance(strands.roots)
-    walkers = np.flatnonzero(height > low)
+    low_now = head.signed_distance(strands.roots) <= low
+    walkers = np.flatnonzero(~low_now)
+    counts = np.zeros(len(strands), np.int64)
+    if not len(walkers):
+        return strands, low_now, counts.astype(np.float32)
+    path, taken, height = _walked_back(strands, walkers, head, low, progress)
+    arrived = height < max(TOUCH, low)
+    low_now[walkers] = arrived
+    counts[walkers] = np.where(arrived, taken, 0)
+    offsets = offsets_from_counts(counts)
+    walker = np.repeat(np.arange(len(walkers)), counts[walkers])
+    back = np.repeat(taken, counts[walkers]) - (np.arange(offsets[-1]) - np.repeat(offsets[walkers], counts[walkers]))
+    points = _joined(path[back, walker], offsets, strands.points, strands.offsets)
+    out = Strands(points, offsets_from_counts(counts + strands.counts), strands.strand_attributes)
+    return out, low_now, (WALK_STEP * counts).astype(np.float32)
+
+
+def _walked_back(strands, walkers, head, low, progress) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The steps of the strands `walkers` (W,) back from their roots, until they are low or have no hair around.
+
+    Returns (path (S + 1, W, 3) float32 mm, the root first; (W,) int64 steps taken; (W,) mm over the head at the last of them).
+    """
     steps = round(LONGEST_WALK / WALK_STEP)
     path = np.zeros((steps + 1, len(walkers), 3), np.float32)
     path[0] = strands.roots[walkers]
     taken = np.zeros(len(walkers), np.int64)
-    if len(walkers):
-        hair = strands.resampled_by_step(2.0 * WALK_STEP)
-        tree, index, tangents = cKDTree(hair.points), hair.strand_index, hair.tangents().astype(np.float64)
-        own, _ = end_tangents(strands)
-        way = course_around(strands, strands.roots[walkers], own[walkers])
+    height = np.array(head.signed_distance(path[0]))
+    hair = strands.resampled_by_step(2.0 * WALK_STEP)
+    tree, index, tangents = cKDTree(hair.points), hair.strand_index, hair.tangents().astype(np.float64)
+    own, _ = end_tangents(strands)
+    way = course_around(strands, path[0], own[walkers])
     going = np.arange(len(walkers))
     for step in range(1, steps + 1):
         progress(step - 1, steps)
-        going = going[head.signed_distance(path[step - 1, going]) > low]
         if not len(going):
             break
         place, onward = path[step - 1, going].astype(np.float64), way[going]
@@ -167,23 +185,14 @@ def follow_to_scalp(
         agreement = np.einsum("nkc,nc->nk", tangents[near], onward)
         weight = np.where(found & (agreement > 0.5), agreement * np.exp(-0.5 * (distance / WALK_SPREAD) ** 2), 0.0)
         heard = weight.sum(axis=1) > 1e-3
-        mean = _unit(np.einsum("nkc,nk->nc", tangents[near], weight))
+        mean = unit(np.einsum("nkc,nk->nc", tangents[near], weight))
         going = going[heard]
-        way[going] = _unit((1.0 - WALK_TURN) * onward + WALK_TURN * mean)[heard]
+        way[going] = unit((1.0 - WALK_TURN) * onward + WALK_TURN * mean)[heard]
         path[step, going] = place[heard] - WALK_STEP * way[going]
         taken[going] = step
-    last = path[taken, np.arange(len(walkers))]
-    arrived = head.signed_distance(last) < max(TOUCH, low)
-    low_now = np.asarray(height <= low)
-    low_now[walkers[arrived]] = True
-    counts = np.zeros(len(strands), np.int64)
-    counts[walkers] = np.where(arrived, taken, 0)
-    offsets = offsets_from_counts(counts)
-    walker = np.repeat(np.arange(len(walkers)), counts[walkers])
-    back = np.repeat(taken, counts[walkers]) - (np.arange(offsets[-1]) - np.repeat(offsets[walkers], counts[walkers]))
-    points = _joined(path[back, walker], offsets, strands.points, strands.offsets)
-    out = Strands(points, offsets_from_counts(counts + strands.counts), strands.strand_attributes)
-    return out, low_now, (WALK_STEP * counts).astype(np.float32)
+        height[going] = head.signed_distance(path[step, going])
+        going = going[height[going] > low]
+    return path, taken, height
 
 
 def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = None) -> tuple[Strands, np.ndarray, int]:
@@ -202,7 +211,7 @@ def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = Non
     depth = np.maximum(head.signed_distance(ends), 0.0).astype(np.float64)
     course = course_around(strands, ends, forward)
     sine = (course * normal).sum(axis=1)
-    along = _unit(course - sine[:, None] * normal)
+    along = unit(course - sine[:, None] * normal)
     sine = np.clip(sine, FLATTEST, 1.0)
     hidden = np.minimum(FOLLOWED_BACK * depth * np.sqrt(1.0 - sine**2) / sine, HIDDEN)
     root = head.closest_scalp(ends - hidden[:, None] * along - depth[:, None] * normal)
@@ -211,7 +220,7 @@ def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = Non
         place, tied = tie_to_knots(root, along, hidden, head, knots)
         root = head.closest_scalp(place)
     gap = np.linalg.norm(root.position - ends, axis=1)
-    leaving = _unit(forward + 0.7 * root.normal)
+    leaving = unit(forward + 0.7 * root.normal)
     counts = np.maximum(np.ceil(gap / ROOT_STEP).astype(np.int64), 1)
     offsets = offsets_from_counts(counts)
     index = np.repeat(np.arange(len(strands)), counts)
@@ -222,10 +231,6 @@ def lead_into_scalp(strands: Strands, head: Head, knots: np.ndarray | None = Non
     joined = _joined(curve.astype(np.float32), offsets, strands.points, strands.offsets)
     lead = Strands(joined, offsets_from_counts(counts + strands.counts), strands.strand_attributes)
     return lead, gap.astype(np.float32), int(tied.sum())
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 @numba.njit(cache=True)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..head import Head, ScalpPoints
+from .direction import unit
 from .linking import assign
 
 HEIGHT = 1.0
@@ -44,8 +45,7 @@ def tie_to_knots(
     if not len(knots) or not len(roots):
         return roots, np.zeros(len(roots), bool)
     normal = found.normal.astype(np.float64)
-    along = course - normal * (course * normal).sum(axis=1, keepdims=True)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    along = unit(course - normal * (course * normal).sum(axis=1, keepdims=True))
     across = np.cross(normal, along)
     spread = np.stack([np.hypot(known, share * hidden) for known, share in (ALONG, ACROSS)], axis=1)
     tree, short = cKDTree(knots), hidden <= SHORT

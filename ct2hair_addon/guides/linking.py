@@ -51,7 +51,8 @@ PER_VOXEL = 0.5
 UNBACKED = 6.0
 """Cost of a voxel of gap, and of a gap that the scan does not back at all."""
 PER_CUT = 0.1
-"""Cost of a voxel that is cut off a trace: where it was dearer to bend than to cut, a tenth of all hair was cut away."""
+"""Cost of a voxel that is cut off a trace: at a fifth of it nearly any bend was dearer, and a tied wig lost a tenth of its
+hair."""
 LOOSE_END = 30.0
 """Cost of a tip that goes on nowhere: joints dearer than this are not made."""
 STEP = 1.0

@@ -222,8 +222,9 @@ def test_in_a_window_the_job_runs_beside_the_events(extension, stand_in, modal, 
     before = block_counts()
     assert modal.start() == {"RUNNING_MODAL"} and modal.context.timers and modal.context.handlers
     assert modal.step("MOUSEMOVE") == {"PASS_THROUGH"}
+    end = time.monotonic() + 60.0
     while "reading the scan 10% 12 s left" not in (modal.context.status or ""):
-        assert modal.step("TIMER") == {"PASS_THROUGH"}
+        assert modal.step("TIMER") == {"PASS_THROUGH"} and time.monotonic() < end
         assert block_counts() == before
         time.sleep(0.02)
     go_on.touch()
