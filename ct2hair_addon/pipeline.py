@@ -28,7 +28,7 @@ from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
-from .refinement import Refined, refine
+from .refinement import Refined, check_device, refine
 from .settings import STOPS, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
@@ -119,6 +119,7 @@ def reconstruct(
     settings = settings or Settings()
     if until is not None and until not in STOPS:
         raise CT2HairError(f"unknown stage '{until}' to stop after; there are {', '.join(STOPS)}")
+    check_device(settings.run.device)
     job = _Job(Path(scan), Path(out), settings, raw_shape, raw_type, template, observer or Silent(), until)
     with _own_folder(job.out), _threads(settings.run.threads):
         return job.run()
@@ -166,7 +167,8 @@ class _Job:
             field = self._stage("orientation", lambda progress: self._orientation(density, level, progress))
             field.save(self.out / "orientation.vdb")
             return self._stop(wig, registration, orientation=field.lines())
-        guides = self._guides(density, level, head, wig.knots)
+        lone = wig.thresholds.strand
+        guides = self._guides(density, level, head, wig.knots, lone)
         if self.until == "guides":
             return self._stop(wig, registration, guides=guides.strands)
 
@@ -174,7 +176,7 @@ class _Job:
             count = settings.interpolation.strands
             if not count and settings.interpolation.method == "scalp":
                 # every guide was traced in the scan: the estimate says how many more there are
-                count = max(estimate_strand_count(density, level, guides.strands, head), len(guides.strands))
+                count = max(estimate_strand_count(density, level, guides.strands, head, peak=lone), len(guides.strands))
             return fill_scalp(guides.strands, head, count, settings.interpolation, seed, progress=progress)
 
         dense = self._stage("dense", fill)
@@ -186,7 +188,9 @@ class _Job:
         )
         refined = self._stage(
             "refinement",
-            lambda progress: refine(dense.strands, density, level, head, wanted, seed, progress=progress),
+            lambda progress: refine(
+                dense.strands, density, level, head, wanted, seed, progress, device=settings.run.device, peak=lone
+            ),
         )
         tallies = {
             "scan": wig.tally,
@@ -228,7 +232,7 @@ class _Job:
     def _orientation(self, density: BrickVolume, level: float, progress: Progress) -> OrientationField:
         return orientation_field(density, level, self.settings.orientation, progress=progress)
 
-    def _guides(self, density: BrickVolume, level: float, head: Head, knots: np.ndarray) -> Guides:
+    def _guides(self, density: BrickVolume, level: float, head: Head, knots: np.ndarray, lone: float) -> Guides:
         """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
@@ -237,7 +241,7 @@ class _Job:
         guides = self._stage(
             "guides",
             lambda progress: trace_guides(
-                density, level, fields.pop(), head, self.settings.guides, self.settings.run.seed, progress, knots
+                density, level, fields.pop(), head, self.settings.guides, self.settings.run.seed, progress, knots, lone
             ),
             guides,
         )

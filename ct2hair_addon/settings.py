@@ -194,12 +194,17 @@ class RefinementSettings:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How the job runs; nothing here but the seed changes the result."""
+    """How the job runs; nothing here but the seed changes the result by more than a rounding."""
 
     seed: int = parameter(0, "seed of everything random", low=0, high=2**31 - 1)
     threads: int = parameter(0, "processor threads; 0 takes all", low=0, high=1024)
     memory: float = parameter(
         0.0, "memory to stay under; 0 takes three quarters of the machine's", unit="GB", low=0.0, high=4096.0
+    )
+    device: str = parameter(
+        "auto",
+        "where strands are fitted to the scan; auto: on a CUDA card where torch has one, on the processor where it has no room",
+        choices=("auto", "cpu", "cuda"),
     )
     orientation: bool = parameter(
         False, "the orientation field, with the traced strands' directions in it, is written as well: orientation.vdb"

@@ -49,7 +49,7 @@ class CT2HAIR_preferences(bpy.types.AddonPreferences):
     )
     device: EnumProperty(
         name="Device",
-        description="What fits strands by the paper's method (chamfer); the other stages run on the processor",
+        description="What strands are fitted to the scan on; the other stages run on the processor",
         items=[
             ("auto", "Automatic", "A CUDA card where the worker's torch has one, else the processor"),
             ("cpu", "Processor", "Never a card"),
@@ -113,8 +113,6 @@ def worker_options(known) -> dict:
     environment = {LOG_LEVEL: known.log_level}
     if known.cache:
         environment["CT2HAIR_CACHE"] = str(chosen_cache(known))
-    if known.device == "cpu":
-        environment["CUDA_VISIBLE_DEVICES"] = ""
     options = {"environment": environment}
     if known.python:
         options["python"] = bpy.path.abspath(known.python)
@@ -122,7 +120,7 @@ def worker_options(known) -> dict:
 
 
 def with_machine(settings: Settings, known) -> Settings:
-    """The settings with threads and memory of the preferences where they leave them open."""
+    """The settings with threads, memory and device of the preferences where they leave them open."""
     if known is None:
         return settings
     run = {}
@@ -130,6 +128,8 @@ def with_machine(settings: Settings, known) -> Settings:
         run["run.threads"] = known.threads
     if not settings.run.memory and known.memory:
         run["run.memory"] = known.memory
+    if settings.run.device == "auto":
+        run["run.device"] = known.device
     return settings.changed(run)
 
 

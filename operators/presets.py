@@ -13,7 +13,7 @@ from ..ct2hair_addon.settings import Settings, parameters
 from .properties import set_settings, settings_of
 
 FOLDER = "ct2hair/reconstruction"
-KEPT = ("scan.spacing", "scan.raw_shape", "scan.raw_type", "head.mesh", "head.place", "run.threads", "run.memory")
+KEPT = ("scan.spacing", "scan.raw_shape", "scan.raw_type", "head.mesh", "head.place", "run.threads", "run.memory", "run.device")
 """Parameters that belong to one scan or one machine, and to no preset."""
 
 

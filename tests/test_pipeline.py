@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from ct2hair_addon import cli, pipeline
 from ct2hair_addon.errors import Cancelled, CT2HairError, ScanError
@@ -157,3 +158,10 @@ def test_too_little_memory_is_said_before_the_long_stages(scan, tmp_path):
     settings = SETTINGS.changed({"run.memory": 0.1})
     with pytest.raises(CT2HairError, match="GB of memory"):
         pipeline.reconstruct(scan, tmp_path / "out", settings)
+
+
+def test_a_card_that_is_not_there_is_said_at_once(scan, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(CT2HairError, match=r"run\.device is cuda"):
+        pipeline.reconstruct(scan, tmp_path / "out", SETTINGS.changed({"run.device": "cuda"}))
+    assert not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from ..volume.grid import BrickVolume, voxel
-from ..volume.strand_signal import TYPICAL_BLUR, StrandProfile
+from ..volume.strand_signal import TYPICAL_BLUR, StrandProfile, alone
 from .sampling import centred
 
 BINS = 16
@@ -23,12 +23,19 @@ CENTRING = 0.25
 kept."""
 
 
-def strand_profile(density: BrickVolume, hair_level: float, voxels: np.ndarray, directions: np.ndarray) -> StrandProfile:
+def strand_profile(
+    density: BrickVolume, hair_level: float, voxels: np.ndarray, directions: np.ndarray, peak: float = 0.0
+) -> StrandProfile:
     """Measure the profile at candidate voxels (M, 3) with unit directions (M, 3).
 
     Of the candidates, those with the emptiest surroundings (two to four voxels off the line) are lone strands; their
-    mean cross-section is fitted. Where the hair is too thick for any, the thinnest tenth stands in, with the usual blur.
+    mean cross-section is fitted. Where the hair is too thick for any, `peak` (a lone strand's by the thresholds) or, where that
+    is not known, the thinnest tenth stands in, with the usual blur.
     """
+    return alone(_measured(density, hair_level, voxels, directions), peak, density.spacing)
+
+
+def _measured(density: BrickVolume, hair_level: float, voxels: np.ndarray, directions: np.ndarray) -> StrandProfile:
     if len(voxels) == 0:
         return StrandProfile.gaussian(max(2.0 * hair_level, 1e-6), TYPICAL_BLUR, density.spacing)
     sums, counts = _cross_sections(density.table, density.bricks, voxels.astype(np.float64), directions.astype(np.float64))

@@ -60,12 +60,13 @@ def find_segments(
     seeds: Seeds,
     settings: GuideSettings,
     progress: Progress = silent,
+    peak: float = 0.0,
 ) -> tuple[Strands, StrandProfile, dict[str, int]]:
     """The pieces of strands that the scan shows, in mm, without a direction; the strand's profile; the tally of the tracing.
 
-    course: which way hair goes, in the density's bricks (`HairField.course`).
+    course: which way hair goes, in the density's bricks (`HairField.course`). peak: a lone strand's, by the thresholds.
     """
-    profile = _profile(density, hair_level, seeds)
+    profile = _profile(density, hair_level, seeds, peak)
     order = seed_order(density, *seeds, profile, part(progress, 0.0, 0.15))
     residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
     found = trace_segments(
@@ -74,12 +75,12 @@ def find_segments(
     return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
 
 
-def _profile(density: BrickVolume, hair_level: float, seeds: Seeds) -> StrandProfile:
+def _profile(density: BrickVolume, hair_level: float, seeds: Seeds, peak: float) -> StrandProfile:
     """A lone strand's profile, measured on the first PROFILED of the shuffled seeds."""
     chosen = np.argsort(seeds.shuffle, kind="stable")[:PROFILED]
     axes = seeds.directions[chosen].astype(np.float64)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return strand_profile(density, hair_level, seeds.voxels[chosen], axes)
+    return strand_profile(density, hair_level, seeds.voxels[chosen], axes, peak)
 
 
 def trace_guides(
@@ -91,22 +92,24 @@ def trace_guides(
     seed: int = 0,
     progress: Progress = silent,
     knots: np.ndarray | None = None,
+    peak: float = 0.0,
 ) -> Guides:
     """Guide strands of the hair in `density` (air at 0, hair above `hair_level`) on `head`.
 
     Segments are traced (`trace`), the fine ones told from the poor (Algorithm 1), all directed root to tip, those that begin
     over the scalp followed back through the hair to it or grown along rooted neighbours, each root led into the scalp, to a
     knot (`knots` (K, 3), mm) where there is one by it, no point left inside the head. With `settings.method` "paper" all of it
-    goes the paper's way instead (`paper`). The same seed gives the same strands, on any number of threads.
+    goes the paper's way instead (`paper`). peak: density of a lone strand by the thresholds, which stands in where none runs
+    alone. The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
     seeds = seed_voxels(field.confidence, field.direction, seed)
     if settings.method == "paper":
         strands, tally = paper_guides(density, field.direction, field.confidence, head, settings, seed, progress)
-        return Guides(strands, _profile(density, hair_level, seeds), tally)
+        return Guides(strands, _profile(density, hair_level, seeds, peak), tally)
     way = field.course()
     del field  # as large as the density in float32: its memory is free from here on if the caller, too, has let go of it
-    segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85))
+    segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85), peak)
     del seeds, way
     floor = data_floor(density, hair_level, head)
     strands, more = root_segments(

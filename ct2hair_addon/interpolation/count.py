@@ -21,10 +21,12 @@ def estimate_strand_count(
     head,
     profile: StrandProfile | None = None,
     progress: Progress = silent,
+    peak: float = 0.0,
 ) -> int:
     """The number of strands in a scan, from its density and the guides found in it (mm, scan frame, root first).
 
-    All hair weighs `hair_mass`; a lone strand weighs `line_mass` per mm, measured on guides that run alone; together, the
+    All hair weighs `hair_mass`; a lone strand weighs `line_mass` per mm, measured on guides that run alone, or as one of
+    `peak`, the thresholds', does where none does; together, the
     scan's length of hair. A piece of hair is as likely to be found as it is long, so the mean length of a strand is
     that of the guides with the share that the scan backs (`support`) as weight. The net's zone, where hair was cut away
     with the net, counts in neither length. `head` answers `signed_distance`. Clamped to FEWEST..MOST; no more than 0.1 mm
@@ -32,7 +34,7 @@ def estimate_strand_count(
     """
     if not len(guides):
         return FEWEST
-    profile = profile or lone_profile(density, hair_level, guides, progress=part(progress, 0.0, 0.6))
+    profile = profile or lone_profile(density, hair_level, guides, peak, part(progress, 0.0, 0.6))
     length = hair_mass(density, part(progress, 0.6, 0.8)) / profile.line_mass
     floor = data_floor(density, hair_level, head)
     support = guides.strand_attributes.get("support")

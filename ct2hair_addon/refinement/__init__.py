@@ -1,6 +1,7 @@
 """Stage 6, refinement: strands fitted to the volume."""
 
 from .agreement import scan_agreement
+from .device import check_device
 from .refine import Refined, refine
 
-__all__ = ["Refined", "refine", "scan_agreement"]
+__all__ = ["Refined", "check_device", "refine", "scan_agreement"]

@@ -15,6 +15,7 @@ from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
 from ..volume import BrickVolume
 from .boundary import Boundary
+from .device import takes_card
 
 BINS = 4
 """Bins of density (n_d, not given in the paper): a voxel of the i-th bin holds i target points."""
@@ -23,6 +24,8 @@ TOP_QUANTILE = 0.99
 CURVE_POINTS = 64
 """Points of each strand after cubic interpolation (supplement 4)."""
 BETAS = (0.9, 0.999)
+BATCH_BYTES = 1e9
+"""Room on a graphics card that a batch of the usual size takes at most."""
 SEARCH = 12
 """Voxels around a strand point within which its nearest target points are looked for, ring by ring; the paper gives no limit,
 and a point farther than this from all hair is pulled by none."""
@@ -36,14 +39,16 @@ def fit_to_points(
     boundary: Boundary,
     settings: RefinementSettings,
     seed: int,
+    device: str = "auto",
     progress: Progress = silent,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Move control points (M, 3) float64 mm, strands by `offsets`, to the scan's points. Returns new points and a tally.
 
     Unlike in the paper, roots are held on the scalp and points are kept out of the head after each step: a Chamfer
-    distance alone pulls the former off it, the scan being empty there.
+    distance alone pulls the former off it, the scan being empty there. device: auto, cpu or cuda, of the optimiser; targets
+    are looked for by the processor.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    place = torch.device("cuda" if takes_card(device, BATCH_BYTES) else "cpu")
     points = np.array(points, np.float64)
     bins = density_bins(density, hair_level)
     sums = {"batches": 0, "iterations": 0, "batches that converged": 0}
@@ -53,7 +58,7 @@ def fit_to_points(
         rows = np.concatenate([np.arange(offsets[n], offsets[n + 1]) for n in group])
         own = np.concatenate([[0], np.cumsum(np.diff(offsets)[group])])
         moved, iterations, converged = _fit_batch(
-            points[rows], own, density, bins, boundary, settings, seed, device, share
+            points[rows], own, density, bins, boundary, settings, seed, place, share
         )  # fmt: skip
         points[rows] = moved
         sums["batches"] += 1

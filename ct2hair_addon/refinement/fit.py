@@ -7,6 +7,7 @@ moves down its slope as a stiff curve with a pinned root, kept lengths and no po
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
 from .curves import eased, easing_lengths, local_curvature, mean_curvature, segment_lengths
+from .device import has_card, takes_card
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -74,9 +76,13 @@ def fit_to_volume(
     profile: StrandProfile,
     boundary: Boundary,
     settings: RefinementSettings,
+    device: str = "auto",
     progress: Progress = silent,
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally."""
+    """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally.
+
+    device: 'auto' takes a graphics card for what is done to voxels where torch has one, 'cpu' none.
+    """
     points = np.array(points, np.float64)
     curvature = mean_curvature(Strands(points.astype(np.float32), offsets), density.spacing)
     bends = STIFF_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
@@ -87,13 +93,15 @@ def fit_to_volume(
     cost = np.array(plan) * (0.2 + np.array([len(level.scan.bricks) for level in levels]) / len(density.bricks))
     done = np.concatenate([[0.0], np.cumsum(cost)]) / max(cost.sum(), 1e-9)
     tally = {"control points": len(points)}
+    potential_of = _potentials(density, device)
+    tally["fitted on a graphics card"] = int(potential_of is not Potential)
     for number, (level, count) in enumerate(zip(levels, plan, strict=True)):
         stage = part(progress, done[number], done[number + 1])
         size = level.scan.spacing
         stiffness = np.clip(bends, settings.stiffness * size, SMOOTH_HAIR * settings.stiffness * size)
         gain = profile.line_mass / size**2
         newton = 8.0 * np.pi * level.blur**4 / gain
-        residual, potential = (np.empty(level.scan.bricks.shape, np.float32) for _ in range(2))
+        potential = potential_of(level.scan, level.blur, gain)
         forces, weights = np.empty_like(points), np.empty(len(points))
         velocity = np.zeros_like(points)
         rest = points.copy()
@@ -105,10 +113,8 @@ def fit_to_volume(
             if iteration % PLANES_EVERY == 0:
                 visible = boundary.look(points)
             voxels = level.scan.to_voxel(points)
-            error = misfit(voxels, offsets, visible, level.scan, level.blur, gain, residual, part(step, 0.0, 0.6))
-            field = BrickVolume(level.scan.table, residual, size, level.scan.origin)
-            blurred(field, level.blur, potential, part(step, 0.6, 0.9))
-            gather_forces(voxels, offsets, visible, level.scan.table, potential, forces, weights)
+            error = potential.update(voxels, offsets, visible, part(step, 0.0, 0.9))
+            potential.forces(voxels, offsets, visible, forces, weights)
             forces *= newton * size
             stiff_step(
                 points, rest, offsets, forces, weights, stiffness, RELAXATION, FRICTION, STEP_LIMIT * size, velocity
@@ -120,8 +126,45 @@ def fit_to_volume(
         if count:
             tally[f"misfit after, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))
         tally["iterations"] = tally.get("iterations", 0) + count
+        del potential
     progress(1.0, 1.0)
     return points, tally
+
+
+class Potential:
+    """What a scan asks of strands: their misfit to it, blurred back, whose slope draws them; worked out by the processor.
+
+    blur: that of a strand in `scan`, voxels. gain: density of one voxel of strand length in a voxel.
+    """
+
+    def __init__(self, scan: BrickVolume, blur: float, gain: float) -> None:
+        self.scan, self.blur, self.gain = scan, blur, gain
+        self.residual, self.values = (np.empty(scan.bricks.shape, np.float32) for _ in range(2))
+
+    def update(self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, progress: Progress = silent) -> float:
+        """Take the potential of strands at `voxels` (M, 3); returns half the weighted square sum of the misfit."""
+        scan = self.scan
+        error = misfit(voxels, offsets, visible, scan, self.blur, self.gain, self.residual, part(progress, 0.0, 0.67))
+        field = BrickVolume(scan.table, self.residual, scan.spacing, scan.origin)
+        blurred(field, self.blur, self.values, part(progress, 0.67, 1.0))
+        return error
+
+    def forces(
+        self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, forces: np.ndarray, weights: np.ndarray
+    ) -> None:
+        """Write what the potential asks of each control point: forces (M, 3) and weights (M,), as `gather_forces`."""
+        gather_forces(voxels, offsets, visible, self.scan.table, self.values, forces, weights)
+
+
+def _potentials(density: BrickVolume, device: str):
+    """What makes the potential of a level of `density`: the processor's, or a graphics card's where there is one."""
+    if device == "cpu" or not has_card():
+        return Potential
+    from . import card  # torch takes seconds to import
+
+    if not takes_card(device, card.bytes_needed(density)):
+        return Potential
+    return partial(card.CardPotential, device=card.CUDA)
 
 
 def _scale(scan: BrickVolume) -> float:

@@ -49,13 +49,16 @@ def refine(
     seed: int = 0,
     progress: Progress = silent,
     profile: StrandProfile | None = None,
+    device: str = "auto",
+    peak: float = 0.0,
 ) -> Refined:
     """Fit strands to the scan that they came from: roots stay where they are, lengths and curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
-    measured on the strands where not given. The same input and seed give the same bits on any number of threads. Raises
-    Cancelled (by progress).
+    measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where none runs alone.
+    device: auto, cpu or cuda (see `device.py`). The same input and seed give the same bits on any number of threads; a
+    graphics card rounds differently. Raises Cancelled (by progress) and CT2HairError (cuda asked for, none there).
     """
     settings = settings or RefinementSettings()
     progress(0.0, 1.0)
@@ -64,7 +67,7 @@ def refine(
     tally = {"strands": len(kept), "dropped: not finite or fewer than two points": len(strands) - len(kept)}
     if not len(kept) or not len(density.bricks):
         return Refined(_supported(kept, density, hair_level), tally, {})
-    profile = profile or lone_profile(density, hair_level, kept, progress=part(progress, 0.0, 0.05))
+    profile = profile or lone_profile(density, hair_level, kept, peak, part(progress, 0.0, 0.05))
     tally["pieces of lone strands measured"] = profile.pieces
     tally["blur of the scan (thousandths of a voxel)"] = round(1000 * profile.blur)
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
@@ -79,7 +82,7 @@ def refine(
         tally |= {f"{name}, before fitting": count for name, count in counts.items()}
     if settings.iterations and len(kept):
         step = part(progress, 0.15, 0.85)
-        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, step)
+        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, step)
         tally |= counts
         if judged:
             points, offsets, kept, counts = _pruned(
@@ -117,13 +120,13 @@ def _pruned(points, offsets, strands, density, profile, boundary, progress, reac
     return points, offsets_from_counts(stay[alive]), strands.select(alive), tally
 
 
-def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, progress):
+def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, progress):
     """The control points after the chosen method, and its tally."""
     if settings.method == "chamfer":
         from .chamfer import fit_to_points  # torch takes seconds to import: only who asks for it pays
 
-        return fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, progress)
-    return fit_to_volume(points, offsets, density, profile, boundary, settings, progress)
+        return fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, device, progress)
+    return fit_to_volume(points, offsets, density, profile, boundary, settings, device, progress)
 
 
 def _supported(strands: Strands, density: BrickVolume, hair_level: float) -> Strands:

@@ -14,6 +14,7 @@ import numpy as np
 from ..progress import Progress, silent
 from ..strands import Strands
 from .grid import BrickVolume, trilinear
+from .structure import SMOOTHING
 
 TYPICAL_BLUR = 0.85
 """Gaussian blur of a scan, voxels, taken where no lone strand can be measured (0.8 to 0.9 in the paper's scans)."""
@@ -28,6 +29,10 @@ ANGLES = 12
 CORE_RINGS = 7
 """A piece is 9 points a voxel apart; its cross-section is sampled on 12 angles and rings 0, 0.5, ... 5 voxels. Rings up to
 3 voxels (core) hold more than 99 % of a strand's mass at a blur of 0.9; those from 3.5 on (moat) tell whether it is alone."""
+
+LONE_EXCESS = 1.15
+"""How much higher what is taken for lone strands may stand than a lone strand by the thresholds, both smoothed as there: lone
+ones are at 0.80 to 0.95 of it whatever the blur and the noise; in a braid, where none is alone, the loneliest are at 1.4."""
 
 MAX_PIECES = 60_000
 MIN_LONE_PIECES = 40
@@ -62,14 +67,25 @@ class StrandProfile:
         return self.peak * self.blur**2 / (self.blur**2 + INTERPOLATION_VARIANCE)
 
 
+def alone(profile: StrandProfile, peak: float, spacing: float) -> StrandProfile:
+    """`profile`, unless it was measured on bundles: then that of `peak`, a lone strand's by the thresholds, and the usual blur.
+
+    The thresholds look all over the scan for the faintest lines, taking the usual blur for granted. peak 0: not known.
+    """
+    usual = StrandProfile.gaussian(peak, TYPICAL_BLUR, spacing)
+    height = [p.peak * p.blur**2 / (p.blur**2 + SMOOTHING**2) for p in (profile, usual)]
+    return usual if 0.0 < LONE_EXCESS * height[1] < height[0] else profile
+
+
 def lone_profile(
     density: BrickVolume, hair_level: float, strands: Strands, peak: float = 0.0, progress: Progress = silent
 ) -> StrandProfile:
     """The profile of a lone strand, measured where pieces of `strands` (mm, scan frame) run alone through the scan.
 
     The cross-section of each piece is averaged along it; the pieces with the emptiest moat around them count, and the
-    typical one (half-sample mode, deaf to pairs that lie in one another) is taken. With too few of them, `peak`
-    (the peak of a lone strand, if known) or the thinner strands' density along the guides and a typical blur stand in.
+    typical one (half-sample mode, deaf to pairs that lie in one another) is taken. With too few of them, or none but bundles
+    (`alone`), `peak` (of a lone strand, by the thresholds) or the thinner strands' density along the guides and a typical blur
+    stand in.
     """
     lines = strands.resampled_by_step(density.spacing) if len(strands) else strands
     per_strand = np.maximum(lines.counts // PIECE_POINTS, 0) if len(strands) else np.zeros(0, np.int64)
@@ -88,7 +104,7 @@ def lone_profile(
         )
     measured = _typical_lone(images, straight, hair_level, density.spacing)
     if measured is not None:
-        return measured
+        return alone(measured, peak, density.spacing)
     axis = images[:, :2].mean(axis=(1, 2)) if len(images) else np.zeros(0)
     axis = axis[axis > hair_level]
     if peak <= 0.0:

@@ -387,11 +387,11 @@ def test_the_preferences_reach_the_worker(extension, tmp_path):
     assert options["environment"] == {
         "CT2HAIR_LOG_LEVEL": "verbose",
         "CT2HAIR_CACHE": str(tmp_path),
-        "CUDA_VISIBLE_DEVICES": "",
     }
     settings = module.with_machine(extension.ct2hair_addon.settings.Settings(), known)
-    assert settings.run.threads == 3 and settings.run.memory == 2.5
-    assert module.with_machine(settings.changed({"run.threads": 1}), known).run.threads == 1
+    assert settings.run.threads == 3 and settings.run.memory == 2.5 and settings.run.device == "cpu"
+    own = module.with_machine(settings.changed({"run.threads": 1, "run.device": "cuda"}), known).run
+    assert own.threads == 1 and own.device == "cuda"
 
 
 def test_only_our_own_is_cleared_from_the_cache(tmp_path, monkeypatch):
