@@ -29,21 +29,25 @@ LEAST_TIED = 0.3
 """Share of roots with a knot from which the usual miss is believed."""
 
 
+def by_the_scalp(knots: np.ndarray, head: Head) -> np.ndarray:
+    """Those of `knots` (K, 3) mm that lie on the scalp: what is farther off is no knot."""
+    knots = np.asarray(knots, np.float64).reshape(-1, 3)
+    return knots[np.abs(head.signed_distance(knots)) < HEIGHT] if len(knots) else knots
+
+
 def tie_to_knots(
-    found: ScalpPoints, course: np.ndarray, hidden: np.ndarray, head: Head, knots: np.ndarray
+    found: ScalpPoints, course: np.ndarray, hidden: np.ndarray, knots: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(roots (N, 3) float64 moved to knots, each knot given to one root at most; (N,) bool which were): the cheapest choice.
+    """(roots (N, 3) float64 moved to knots, each knot given to one root at most; (N,) the knot of each, -1 for none): the
+    cheapest choice.
 
     found: on the scalp, where roots were looked for. course (N, 3): which way their hair goes. hidden (N,): mm of it that are
     hidden. knots: (K, 3) mm. Roots without a knot, of hair hidden for no more than SHORT, are moved by what others like them
     usually missed, along their hair. None is put back onto the scalp.
     """
     roots = np.array(found.position, np.float64)
-    knots = np.asarray(knots, np.float64).reshape(-1, 3)
-    if len(knots):
-        knots = knots[np.abs(head.signed_distance(knots)) < HEIGHT]
     if not len(knots) or not len(roots):
-        return roots, np.zeros(len(roots), bool)
+        return roots, np.full(len(roots), -1)
     normal = found.normal.astype(np.float64)
     along = unit(course - normal * (course * normal).sum(axis=1, keepdims=True))
     across = np.cross(normal, along)
@@ -57,7 +61,7 @@ def tie_to_knots(
             break
         roots[short] += np.median(((knots[chosen[known]] - roots[known]) * along[known]).sum(axis=1)) * along[short]
     roots[tied] = knots[chosen[tied]]
-    return roots, tied
+    return roots, chosen
 
 
 def _chosen(roots, along, across, spread, knots, tree) -> np.ndarray:
@@ -69,7 +73,14 @@ def _chosen(roots, along, across, spread, knots, tree) -> np.ndarray:
     row, column = np.nonzero(cost < LOOSE)
     knot, cost = near[row, column].astype(np.int64), cost[row, column]
     order = np.lexsort((knot, row))
-    chosen = np.full(max(len(roots), len(knots)), -1, np.int64)
-    starts = np.searchsorted(row[order], np.arange(len(chosen) + 1))
-    assign(starts, knot[order], cost[order], LOOSE, chosen)
-    return chosen[: len(roots)]
+    return chosen_knots(row[order], knot[order], cost[order], len(roots), len(knots))
+
+
+def chosen_knots(row: np.ndarray, knot: np.ndarray, cost: np.ndarray, roots: int, knots: int) -> np.ndarray:
+    """(roots,) the knot of each root, -1 for none, at the least sum of costs: LOOSE for a root without one.
+
+    row, knot, cost (J,): which of the `knots` each root may have, rows ascending, each pair once.
+    """
+    chosen = np.full(max(roots, knots), -1, np.int64)
+    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, LOOSE, chosen)
+    return chosen[:roots]

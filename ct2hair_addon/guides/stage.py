@@ -14,10 +14,11 @@ from ..strands import Strands
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor
 from .direction import fine_ends, signs
-from .growing import follow_to_scalp, grow_to_root, lead_into_scalp, push_out
+from .growing import follow_to_scalp, grow_to_root
 from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
 from .profile import strand_profile
+from .roots import lead_into_scalp, push_out
 from .seeds import Seeds, seed_order, seed_voxels
 from .trace import trace_segments
 
@@ -154,9 +155,8 @@ def root_segments(
         directed, rooted, bridged = segments.reversed(value < 0), fine != 0, np.zeros(len(segments), np.float32)
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
     traced = directed.lengths() - bridged
-    bodies, low, walked = follow_to_scalp(
-        directed.resampled_by_step(_step(spacing)), head, floor + SHOWN * spacing, part(progress, 0.5, 0.6)
-    )
+    seen = directed.resampled_by_step(_step(spacing))
+    bodies, low, walked = follow_to_scalp(seen, head, floor + SHOWN * spacing, part(progress, 0.5, 0.6))
     tally["followed back through the hair"] = int((walked > 0).sum())
     bodies, reached, grown = grow_to_root(bodies, rooted | low, settings)
     grown += walked
@@ -166,8 +166,10 @@ def root_segments(
     enough = reached & (backed >= settings.min_support)
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
-    rooted, _, tied = lead_into_scalp(kept, head, knots if settings.knots else None)
+    made = (bodies.counts - seen.counts)[enough]
+    rooted, tied, late = lead_into_scalp(kept, head, knots if settings.knots else None, made, part(progress, 0.7, 0.85))
     tally["roots at knots of the net"] = tied
+    tally["led to knots that were left"] = late
     progress(0.85, 1.0)
     rooted, pushed = push_out(rooted, head)
     rooted = rooted.resampled_by_step(_step(spacing))

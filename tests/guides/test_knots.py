@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ct2hair_addon.guides.growing import lead_into_scalp
-from ct2hair_addon.guides.knots import tie_to_knots
+from ct2hair_addon.guides.knots import by_the_scalp, tie_to_knots
+from ct2hair_addon.guides.roots import lead_into_scalp
 from ct2hair_addon.head import Head
 from ct2hair_addon.strands import Strands
 
@@ -43,7 +43,9 @@ def tied_hair(ball):
 
 def test_roots_go_to_their_own_knots(ball, tied_hair):
     knots, found, forward = tied_hair
-    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots)
+    roots, knot = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), knots)
+    tied = knot >= 0
+    np.testing.assert_array_equal(roots[tied], knots[knot[tied]])
     assert tied.mean() > 0.98
     off = np.linalg.norm(roots - knots, axis=1)
     assert np.mean(off < 0.05) > 0.93, "most should find the knot that they were drawn from"
@@ -53,8 +55,8 @@ def test_roots_go_to_their_own_knots(ball, tied_hair):
 def test_roots_without_a_knot_take_what_the_others_missed(ball, tied_hair):
     knots, found, forward = tied_hair
     seen = np.random.default_rng(1).permutation(len(knots))[: int(0.6 * len(knots))]
-    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots[seen])
-    alone = ~tied
+    roots, knot = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), knots[seen])
+    alone = knot < 0
     assert 0.2 < alone.mean() < 0.5
     before, after = (np.median(np.linalg.norm(some[alone] - knots[alone], axis=1)) for some in (found.position, roots))
     assert after < 0.6 * before
@@ -67,25 +69,28 @@ def test_hair_that_is_hidden_for_long_may_come_from_farther_back(ball, tied_hair
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     few = np.arange(0, len(knots), 25)  # far from one another
     far = ball.closest_scalp(knots[few] - 7.0 * along[few])
-    roots, tied = tie_to_knots(far, forward[few], np.full(len(few), 12.0), ball, knots[few])
+    roots, knot = tie_to_knots(far, forward[few], np.full(len(few), 12.0), knots[few])
+    tied = knot >= 0
     assert tied.mean() > 0.9
     np.testing.assert_allclose(roots[tied], knots[few][tied])
-    roots, tied = tie_to_knots(far, forward[few], np.full(len(few), HIDDEN), ball, knots[few])
+    roots, knot = tie_to_knots(far, forward[few], np.full(len(few), HIDDEN), knots[few])
     assert np.mean(np.linalg.norm(roots - knots[few], axis=1) < 0.05) < 0.1
 
 
 @pytest.mark.parametrize("knots", [np.zeros((0, 3)), np.full((5, 3), 400.0)])
 def test_without_knots_by_the_scalp_nothing_moves(knots, ball, tied_hair):
     _, found, forward = tied_hair
-    roots, tied = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), ball, knots)
+    knots = by_the_scalp(knots, ball)
+    assert not len(knots)
+    roots, knot = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), knots)
     np.testing.assert_array_equal(roots, found.position)
-    assert not tied.any()
+    assert (knot < 0).all()
 
 
 def test_the_lead_starts_at_the_knot(ball, tied_hair):
     knots, _, forward = tied_hair
     knot, way = knots[:1], forward[:1]
     line = knot + 1.2 * ball.closest_scalp(knot).normal + np.linspace(0.0, 40.0, 40)[:, None] * way
-    led, _, tied = lead_into_scalp(Strands.from_polylines([line]), ball, knot)
-    assert tied == 1
+    led, tied, late = lead_into_scalp(Strands.from_polylines([line]), ball, knot)
+    assert (tied, late) == (1, 0)
     np.testing.assert_allclose(led.roots, knot, atol=0.02)

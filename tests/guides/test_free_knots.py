@@ -1,0 +1,98 @@
+"""Hair that streams over other hair's roots: what has no knot is led back to one that is left, over the way that it came."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ct2hair_addon.guides.free_knots import AS_FAR, LEAVING, lead_to_free_knots
+from ct2hair_addon.guides.growing import WALK_STEP, follow_to_scalp
+from ct2hair_addon.guides.roots import lead_into_scalp
+from ct2hair_addon.head import Head
+from ct2hair_addon.strands import Strands
+
+RADIUS = 80.0
+APART = 0.02
+"""Radians of azimuth between two hairs."""
+
+
+@pytest.fixture(scope="module")
+def ball(make_ball) -> Head:
+    return Head(make_ball(RADIUS, rings=90, sides=180))
+
+
+def place(azimuth, s, height):
+    """Where a meridian is `s` mm from near the ball's top, `height` mm over it."""
+    polar, radius = 0.4 + np.asarray(s) / RADIUS, RADIUS + np.asarray(height)
+    outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return np.asarray(radius)[..., None] * (np.sin(polar)[..., None] * outwards + np.cos(polar)[..., None] * [0, 0, 1.0])
+
+
+def lying(azimuth: float, start: float, end: float) -> np.ndarray:
+    s = np.arange(start, end, WALK_STEP)
+    return place(azimuth, s, 1.0 + 0.05 * s)
+
+
+@pytest.fixture(scope="module")
+def stream(ball):
+    """(strands, made, rest, knots): twelve that come from the top, five between them that begin in the stream, and their knots
+    12 to 20 mm before; of the latter the first two were followed back a while."""
+    whole = [lying(APART * n, 0.0, 70.0) for n in range(12)]
+    late = [APART * (n + 0.5) for n in (1, 3, 5, 7, 9)]
+    knots = np.array([ball.closest_scalp(place(a, [14.0 + 2 * n], 0.0)).position[0] for n, a in enumerate(late)], float)
+    strands = Strands.from_polylines([*whole, *(lying(a, 20.0 if n < 2 else 32.0, 70.0) for n, a in enumerate(late))])
+    made = np.array([30] * 12 + [24] * 2 + [0] * 3)
+    return strands, made, np.arange(12, 17), knots
+
+
+def test_each_finds_the_knot_that_it_passed(ball, stream):
+    strands, made, rest, knots = stream
+    led, roots, tied = lead_to_free_knots(strands, made, rest, knots, ball)
+    assert np.flatnonzero(tied).tolist() == rest.tolist()
+    np.testing.assert_allclose(roots[rest], knots)
+    np.testing.assert_array_equal(led.tips, strands.tips)
+    for n, line in enumerate(led.polylines()):
+        old = strands.polylines()[n]
+        if n < 12:
+            np.testing.assert_array_equal(line, old)
+            continue
+        np.testing.assert_array_equal(line[-60:], old[-60:])  # what was traced stays
+        height = ball.signed_distance(line)
+        assert height[0] < 1.6 and height.min() > 0.5 and np.diff(height).min() > -0.1, "rises from the scalp to its trace"
+        assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() < 1.6
+        assert np.linalg.norm(line[0] - knots[n - 12]) < 6.0
+
+
+def test_a_knot_is_given_once_and_the_nearest_way_wins(ball, stream):
+    strands, made, rest, knots = stream
+    led, roots, tied = lead_to_free_knots(strands, made, rest, knots[[3]], ball)
+    assert np.flatnonzero(tied).tolist() == [15]
+    np.testing.assert_allclose(roots[15], knots[3])
+    others = np.arange(len(strands)) != 15
+    for line, old in zip(led.select(others).polylines(), strands.select(others).polylines(), strict=True):
+        np.testing.assert_array_equal(line, old)
+
+
+def test_where_hair_stands_up_no_knot_is_looked_for_far_back(ball, stream):
+    strands, made, rest, knots = stream
+    short = np.minimum(made, 1)
+    assert AS_FAR * WALK_STEP < LEAVING
+    led, _, tied = lead_to_free_knots(strands, short, rest, knots, ball)
+    assert not tied.any()
+    np.testing.assert_array_equal(led.points, strands.points)
+    led, _, tied = lead_to_free_knots(strands, made, rest[:0], knots, ball)
+    assert not tied.any() and led is strands
+
+
+def test_strands_followed_past_their_knots_come_back_to_them(ball, stream):
+    """As the guides do it: what begins in the stream is followed to where that begins, where the knots are others'."""
+    strands, _, rest, knots = stream
+    of_others = np.array([ball.closest_scalp(place(APART * n, [-8.0], 0.0)).position[0] for n in range(12)], float)
+    seen = Strands.from_polylines([*strands.polylines()[:12], *(lying(APART * (n + 0.5), 44.0, 70.0) for n in (1, 3, 5, 7, 9))])
+    bodies, low, _ = follow_to_scalp(seen, ball, 1.4)
+    assert low.all()
+    made = bodies.counts - seen.counts
+    rooted, tied, late = lead_into_scalp(bodies, ball, np.concatenate([of_others, knots]), made)
+    assert late == len(rest) and tied >= len(rest)
+    np.testing.assert_allclose(rooted.roots[rest], knots, atol=0.05)
+    assert ball.signed_distance(rooted.points).min() > -0.2
