@@ -459,16 +459,32 @@ def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
     return following, cut
 
 
-@numba.njit(cache=True)
-def assign(starts, columns, costs, loose, chosen):
-    """Fill `chosen` (R,): each row's column, or -1, at the least sum of costs, `loose` for a row without one.
+def assign(starts: np.ndarray, columns: np.ndarray, costs: np.ndarray, loose: float, chosen: np.ndarray) -> None:
+    """Fill `chosen` (R,) int64: each row's column, or -1, at the least sum of costs, `loose` for a row without one.
 
-    Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`. Shortest augmenting paths over reduced costs
-    (Jonker and Volgenant 1987); each search ends where leaving somebody loose is cheapest, so it stays among neighbours.
+    Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`, none below 0. Shortest augmenting paths over
+    reduced costs (Jonker and Volgenant 1987); each search ends where leaving somebody loose is cheapest, so it stays among
+    neighbours, and looks at a row's columns, cheapest first, no farther than its end may lie.
     """
+    order = np.empty(len(costs), np.int32 if len(costs) < 2**31 else np.int64)
+    _by_cost(starts, costs, order)
+    _assign(starts, columns[order].astype(np.int32), costs[order], loose, chosen)
+
+
+@numba.njit(cache=True, parallel=True)
+def _by_cost(starts, costs, order):
+    """Each row's joints, cheapest first."""
+    for row in numba.prange(len(starts) - 1):
+        low, high = starts[row], starts[row + 1]
+        order[low:high] = low + np.argsort(costs[low:high], kind="mergesort")
+
+
+@numba.njit(cache=True)
+def _assign(starts, columns, costs, loose, chosen):
+    """`assign` of joints that are sorted by row and cost."""
     rows = len(chosen)
     owner = np.full(rows, -1, np.int64)
-    row_price, column_price = np.zeros(rows), np.zeros(rows)
+    row_price, column_price = np.zeros(rows), np.zeros(rows)  # of columns none is above 0
     distance, before = np.empty(rows), np.empty(rows, np.int64)
     seen, done = np.full(rows, -1, np.int64), np.full(rows, -1, np.int64)
     for first in range(rows):
@@ -479,11 +495,14 @@ def assign(starts, columns, costs, loose, chosen):
         while True:
             if far + loose - row_price[row] < nearest:
                 nearest, last_row, last_column = far + loose - row_price[row], row, -1
+            start = far - row_price[row]
             for k in range(starts[row], starts[row + 1]):
-                column = columns[k]
+                if start + costs[k] >= nearest:
+                    break  # nor is any that is dearer
+                column = np.int64(columns[k])
                 if done[column] == first:
                     continue
-                way = far + costs[k] - row_price[row] - column_price[column]
+                way = start + costs[k] - column_price[column]
                 if way < nearest and (seen[column] != first or way < distance[column]):
                     seen[column], distance[column], before[column] = first, way, row
                     heapq.heappush(heap, (way, column))
