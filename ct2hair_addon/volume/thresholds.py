@@ -54,6 +54,11 @@ PEAK_EVERY = 4.5
 """voxel; a strand shows a peak about that often along its way."""
 PILE = 0.4
 """A pile of heights counts from this share of the highest one on."""
+PILE_BIN, PILE_TAPS = 0.04, np.array([0.06, 0.24, 0.4, 0.24, 0.06])
+"""Bins of the heights' logarithm, and the weights under which piles are looked at."""
+STANDS_OUT, LEAST_PILE = (0.75, 4.0), (100, 0.02)
+"""A lower pile counts, too, where heights fall to this share of it before they rise again, by so many standard deviations, and
+so many lines, and this share of all, are in it: the few strands that run alone beside a braid."""
 HAIR_SHARE = 0.4
 """A voxel is hair above this share of a lone strand's peak."""
 KNOT_SHARE = 2.2
@@ -202,12 +207,26 @@ def strand_level(peaks: np.ndarray, goes_on: np.ndarray) -> tuple[float, int, fl
         return 0.0, 0, 0.0
     height = np.log(np.maximum(peaks[line, 0], 1e-30))
     low, high = np.quantile(height, [0.0, 0.9])
-    counts, edges = np.histogram(height, np.arange(low - 0.3, high + 0.34, 0.04))
-    smooth = np.convolve(counts, [0.06, 0.24, 0.4, 0.24, 0.06], mode="same")
-    piles = np.flatnonzero((smooth[1:-1] >= smooth[:-2]) & (smooth[1:-1] > smooth[2:])) + 1
-    piles = piles[smooth[piles] > PILE * smooth.max()]
-    pile = piles[0] if len(piles) else int(smooth.argmax())
+    counts, edges = np.histogram(height, np.arange(low - 0.3, high + 0.34, PILE_BIN))
+    pile = _lowest_pile(counts.astype(np.float64))
     return float(np.exp(0.5 * (edges[pile] + edges[pile + 1]))) / LINE_SHARE, lines, lines / (lines + sheets)
+
+
+def _lowest_pile(counts: np.ndarray) -> int:
+    """The bin of `counts` (B,) float64 in which the lowest pile that counts has its top."""
+    smooth = np.convolve(counts, PILE_TAPS, mode="same")
+    noise = np.sqrt(np.convolve(counts, PILE_TAPS**2, mode="same"))
+    tops = np.flatnonzero((smooth[1:-1] >= smooth[:-2]) & (smooth[1:-1] > smooth[2:])) + 1
+    for top in tops:
+        if smooth[top] > PILE * smooth.max():
+            return int(top)
+        higher = np.flatnonzero(smooth[top:] > smooth[top])
+        dip = top + int(smooth[top : top + higher[0]].argmin()) if len(higher) else len(smooth) - 1
+        held = counts[: dip + 1].sum()
+        falls = smooth[dip] < STANDS_OUT[0] * smooth[top] and smooth[top] - smooth[dip] > STANDS_OUT[1] * noise[top]
+        if falls and held >= max(LEAST_PILE[0], LEAST_PILE[1] * counts.sum()):
+            return int(top)
+    return int(smooth.argmax())
 
 
 def _slabs(depth: int) -> list[tuple[int, int]]:

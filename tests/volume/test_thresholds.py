@@ -56,6 +56,22 @@ def test_the_lowest_pile_of_lines_is_a_lone_strands():
     assert strand_level(peaks, np.full((len(height), 2), (0, 10)))[:2] == (0.0, 0)
 
 
+@pytest.mark.parametrize("alone, spread", [(0.04, 0.18), (0.1, 0.1)], ids=["a few, noisy", "more"])
+def test_the_few_lone_strands_beside_a_braid_are_the_level(alone, spread):
+    generator = np.random.default_rng(8)
+    bundles = np.exp(generator.normal(np.log(9.0), 0.5, 7000))
+    lone = np.exp(generator.normal(0.0, spread, int(7000 * alone)))
+    height = np.concatenate([bundles[bundles > 1.8], lone])
+    peaks = np.stack([100.0 * LINE_SHARE * height, np.zeros(len(height))], axis=1).astype(np.float32)
+    line = np.full((len(height), 2), (1, 10), np.int16)
+    assert strand_level(peaks, line)[0] == pytest.approx(100.0, rel=0.15)
+    # a scatter of faint ones is no pile, nor is the foot of a heap
+    few = np.concatenate(
+        [np.arange(len(lone))[: len(lone) // 8] + int((bundles > 1.8).sum()), np.arange((bundles > 1.8).sum())]
+    )
+    assert strand_level(peaks[few], line[few])[0] == pytest.approx(900.0, rel=0.3)
+
+
 @pytest.fixture(scope="module")
 def scan_of(ball, spikes, tmp_path_factory):
     """How a scan of the spikes on the ball is made, each once."""
