@@ -29,6 +29,8 @@ LEAVING = 4.0
 """mm behind its knot at which a strand is among the hair."""
 LOW = 0.8
 """mm over the scalp that it is at there."""
+CHUNK = 4096
+"""Strands whose ways are looked at together: some 300 MB."""
 
 
 def lead_to_free_knots(
@@ -45,25 +47,38 @@ def lead_to_free_knots(
     if not len(rest) or not len(free):
         return strands, knots, tied
     way, counts = _ways(strands, made, rest, head, progress)
-    owner, begin = np.repeat(np.arange(len(rest)), counts), np.repeat(offsets_from_counts(counts)[:-1], counts)
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-    back = along - along[begin]
-    below = head.closest_scalp(way)
-    near, knot = cKDTree(free).query(below.position, k=min(CANDIDATES, len(free)), distance_upper_bound=FARTHEST, workers=-1)
-    near, knot = near.reshape(len(way), -1), knot.reshape(len(way), -1)
+    offsets = offsets_from_counts(counts)
     followed = strands.arc_lengths()[strands.offsets[:-1] + made][made > 0]
     farthest = AS_FAR * np.median(followed) if len(followed) else 0.0
-    step, column = np.nonzero(np.isfinite(near) & ((back >= LEAVING) & (back <= farthest))[:, None])
-    cost = (near[step, column] / BESIDE) ** 2 + A_MILLIMETRE * back[step]
-    # of the steps that pass a knot, the cheapest
-    order = np.lexsort((cost, knot[step, column], owner[step]))
-    step, pair, cost = step[order], owner[step[order]] * len(free) + knot[step, column][order], cost[order]
-    once = np.unique(pair, return_index=True)[1]
-    step, cost, pair = step[once], cost[once], pair[once]
-    chosen = chosen_knots(pair // len(free), pair % len(free), cost, len(rest), len(free))
+    tree = cKDTree(free)
+    parts = []
+    for low in range(0, len(rest), CHUNK):
+        high = min(low + CHUNK, len(rest))
+        owner, knot, cost, step = _passed(way[offsets[low] : offsets[high]], counts[low:high], tree, head, farthest)
+        parts.append((owner + low, knot, cost, step + offsets[low]))
+    owner, knot, cost, step = (np.concatenate(column) for column in zip(*parts, strict=True))
+    chosen = chosen_knots(owner, knot, cost, len(rest), len(free))
     won = np.flatnonzero(chosen >= 0)
-    first = step[np.searchsorted(pair, won * len(free) + chosen[won])]
-    return _relaid(strands, made, rest[won], free[chosen[won]], way, begin, first, below, head)
+    at = step[np.searchsorted(owner * len(free) + knot, won * len(free) + chosen[won])]
+    return _relaid(strands, made, rest[won], free[chosen[won]], way, offsets[won], at, head)
+
+
+def _passed(way, counts, tree, head, farthest):
+    """Which knots of `tree` the ways (points (S, 3), `counts` (W,) each) pass, `farthest` mm back at most: (owner, knot, cost,
+    step) (J,) each, by owner and knot, each pair once, at the step that passes it the cheapest."""
+    owner, begin = np.repeat(np.arange(len(counts)), counts), np.repeat(offsets_from_counts(counts)[:-1], counts)
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
+    back = along - along[begin]
+    some = np.flatnonzero((back >= LEAVING) & (back <= farthest))
+    below = head.closest_scalp(way[some]).position
+    candidates = np.arange(1, min(CANDIDATES, tree.n) + 1)
+    near, knot = tree.query(below, k=candidates, distance_upper_bound=FARTHEST, workers=-1)
+    row, column = np.nonzero(np.isfinite(near))
+    step, knot = some[row], knot[row, column].astype(np.int64)
+    cost = (near[row, column] / BESIDE) ** 2 + A_MILLIMETRE * back[step]
+    order = np.lexsort((cost, knot, owner[step]))
+    order = order[np.unique(owner[step[order]] * tree.n + knot[order], return_index=True)[1]]
+    return owner[step[order]], knot[order], cost[order], step[order]
 
 
 def _ways(strands: Strands, made: np.ndarray, rest: np.ndarray, head: Head, progress: Progress):
@@ -81,22 +96,25 @@ def _ways(strands: Strands, made: np.ndarray, rest: np.ndarray, head: Head, prog
     return points, counts
 
 
-def _relaid(strands, made, won, knot, way, begin, first, below, head):
-    """The strands `won` from their `knot` (W, 3) on: over the scalp below their `way`, rising evenly to their traced part."""
+def _relaid(strands, made, won, knot, way, begin, at, head):
+    """The strands `won` from their `knot` (W, 3) on: over the scalp below their `way`, rising evenly to their traced part.
+
+    begin, at (W,): the points of `way` where they were traced from, and by their knot.
+    """
     knots, tied = np.zeros((len(strands), 3)), np.zeros(len(strands), bool)
     knots[won], tied[won] = knot, True
     # steps from the last that leaves the scalp to the first behind the trace
-    last = first - round(LEAVING / WALK_STEP)
+    last = at - round(LEAVING / WALK_STEP)
     counts = np.zeros(len(strands), np.int64)
-    counts[won] = np.maximum(last - begin[first], 0)
+    counts[won] = np.maximum(last - begin, 0)
     offsets = offsets_from_counts(counts)
     owner = np.repeat(np.arange(len(won)), counts[won])
     step = np.repeat(last, counts[won]) - (np.arange(offsets[-1]) - offsets[won][owner])
-    share = (step - begin[step]) / np.maximum(first - begin[first], 1)[owner]
-    height = np.maximum(head.signed_distance(way[begin[first]]), LOW)
-    aside = knot - below.position[first]
-    up = LOW + (height[owner] - LOW) * (1.0 - share)
-    points = below.position[step] + share[:, None] * aside[owner] + up[:, None] * below.normal[step]
+    share = ((step - begin[owner]) / np.maximum(at - begin, 1)[owner])[:, None]
+    height = np.maximum(head.signed_distance(way[begin]), LOW)[owner, None]
+    aside = knot - head.closest_scalp(way[at]).position
+    below = head.closest_scalp(way[step])
+    points = below.position + share * aside[owner] + (LOW + (height - LOW) * (1.0 - share)) * below.normal
     cut = np.where(tied, made, 0)
     keep = np.arange(len(strands.points)) - np.repeat(strands.offsets[:-1], strands.counts) >= np.repeat(cut, strands.counts)
     traced, traced_offsets = strands.points[keep], offsets_from_counts(strands.counts - cut)
