@@ -18,6 +18,7 @@ from .knots import chosen_knots
 BESIDE = 1.2
 """mm beside a strand's way back over the scalp that its knot is usually off."""
 FARTHEST = 4.0 * BESIDE
+"""mm; a knot farther beside it is none of the strand's."""
 A_MILLIMETRE = 0.04
 """Cost of a millimetre back along that way: of two knots the nearer one."""
 AS_FAR = 4.0

@@ -36,6 +36,7 @@ def strand_profile(
 
 
 def _measured(density: BrickVolume, hair_level: float, voxels: np.ndarray, directions: np.ndarray) -> StrandProfile:
+    """`strand_profile` by the scan alone."""
     if len(voxels) == 0:
         return StrandProfile.gaussian(max(2.0 * hair_level, 1e-6), TYPICAL_BLUR, density.spacing)
     sums, counts = _cross_sections(density.table, density.bricks, voxels.astype(np.float64), directions.astype(np.float64))

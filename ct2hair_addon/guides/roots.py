@@ -8,6 +8,7 @@ import numpy as np
 from ..head import Head
 from ..progress import Progress, silent
 from ..strands import Strands, offsets_from_counts
+from ..volume.strand_signal import outward
 from .direction import end_tangents, unit
 from .free_knots import lead_to_free_knots
 from .growing import course_around, joined
@@ -101,16 +102,10 @@ def push_out(strands: Strands, head: Head) -> tuple[Strands, int]:
     depth = head.signed_distance(points)
     moved = np.flatnonzero((depth < CLEARANCE) & ~first)
     total = len(moved)
-    step = 0.25
     for _ in range(4):
         if not len(moved):
             break
-        at = points[moved]
-        slope = np.stack(
-            [head.signed_distance(at + step * axis) - head.signed_distance(at - step * axis) for axis in np.eye(3)], axis=1
-        ).astype(np.float64)
-        slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
-        points[moved] = at + slope * (CLEARANCE * 1.5 - depth[moved])[:, None]
+        points[moved] += outward(points[moved], head) * (CLEARANCE * 1.5 - depth[moved])[:, None]
         depth[moved] = head.signed_distance(points[moved])
         moved = moved[depth[moved] < CLEARANCE]
     return strands.with_points(points.astype(np.float32)), total

@@ -28,7 +28,7 @@ PADDING = 2
 
 def bytes_needed(volume: BrickVolume) -> float:
     """What a fit to `volume` takes on the card: the scan's bricks, two of float32 with a ring around them, and room to work."""
-    stored = int(np.count_nonzero(_ringed(volume.table)))
+    stored = int(np.count_nonzero(_ringed(_padded(volume.table))))
     return WORKSPACE + BRICK**3 * (len(volume.bricks) * volume.bricks.itemsize + 8.0 * (stored + 1))
 
 
@@ -37,8 +37,8 @@ class CardPotential:
 
     def __init__(self, scan: BrickVolume, blur: float, gain: float, device: torch.device) -> None:
         self.device, self.gain, self.peak = device, gain, gain / (2.0 * np.pi * blur**2)
-        table = np.pad(scan.table, PADDING, constant_values=-1)
-        ring = ndimage.binary_dilation(table >= 0, np.ones((3, 3, 3))) & (table < 0)
+        table = _padded(scan.table)
+        ring = _ringed(table) & (table < 0)
         self.own, self.empty = len(scan.bricks), len(scan.bricks) + int(np.count_nonzero(ring))
         table[ring] = np.arange(self.own, self.empty, dtype=np.int32)
         table[table < 0] = self.empty
@@ -215,6 +215,11 @@ def _band(taps: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(band)
 
 
+def _padded(table: np.ndarray) -> np.ndarray:
+    """The table with PADDING bricks around it that hold nothing."""
+    return np.pad(table, PADDING, constant_values=-1)
+
+
 def _ringed(table: np.ndarray) -> np.ndarray:
-    """Which bricks of the padded table are stored on the card: those of the scan and a ring of one around them."""
-    return ndimage.binary_dilation(np.pad(table, PADDING, constant_values=-1) >= 0, np.ones((3, 3, 3)))
+    """Which bricks of a padded table are stored on the card: those of the scan and a ring of one around them."""
+    return ndimage.binary_dilation(table >= 0, np.ones((3, 3, 3)))

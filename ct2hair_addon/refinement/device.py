@@ -10,7 +10,7 @@ from ..errors import CT2HairError
 
 def check_device(device: str) -> None:
     """Raise CT2HairError where `device` (auto, cpu or cuda) is cuda and torch finds no card. Quick for the others."""
-    if device != "cuda" or has_card():
+    if device != "cuda" or _has_card():
         return
     raise CT2HairError(
         f"run.device is cuda, but {_build()} finds no CUDA card; install a CUDA build of torch and the card's driver, "
@@ -18,13 +18,13 @@ def check_device(device: str) -> None:
     )
 
 
-def takes_card(device: str, needed: float) -> bool:
+def takes_card(device: str, needed: float = 0.0) -> bool:
     """Whether work that needs so many bytes on a card runs on one: not with device cpu, nor where no card has so much free.
 
     Raises CT2HairError where cuda is asked for and there is no card.
     """
     check_device(device)
-    if device == "cpu" or not has_card():
+    if device == "cpu" or not _has_card():
         return False
     import torch
 
@@ -39,7 +39,7 @@ def _build() -> str:
         return "a Python without torch"
 
 
-def has_card() -> bool:
+def _has_card() -> bool:
     """Whether torch can run on CUDA; torch, which takes seconds to import, is asked only where it is no CPU build."""
     if importlib.util.find_spec("torch") is None or _build().endswith("+cpu"):
         return False

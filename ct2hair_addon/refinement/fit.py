@@ -18,7 +18,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
 from .curves import eased, easing_lengths, local_curvature, mean_curvature, segment_lengths
-from .device import has_card, takes_card
+from .device import takes_card
 from .motion import gather_forces, keep_lengths, stiff_step
 from .splat import blurred, halved, misfit
 
@@ -158,7 +158,7 @@ class Potential:
 
 def _potentials(density: BrickVolume, device: str):
     """What makes the potential of a level of `density`: the processor's, or a graphics card's where there is one."""
-    if device == "cpu" or not has_card():
+    if not takes_card(device):
         return Potential
     from . import card  # torch takes seconds to import
 

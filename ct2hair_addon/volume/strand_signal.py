@@ -14,9 +14,9 @@ import numpy as np
 from ..progress import Progress, silent
 from ..strands import Strands
 from .grid import BrickVolume, trilinear
-from .structure import SMOOTHING
+from .structure import SMOOTHING, STRAND_BLUR
 
-TYPICAL_BLUR = 0.85
+TYPICAL_BLUR = STRAND_BLUR
 """Gaussian blur of a scan, voxels, taken where no lone strand can be measured (0.8 to 0.9 in the paper's scans)."""
 
 INTERPOLATION_VARIANCE = 1.0 / 6.0

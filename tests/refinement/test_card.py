@@ -91,8 +91,7 @@ def test_a_fit_on_the_card_ends_where_the_processors_does(scene, monkeypatch):
     given = scan.to_scan(voxels)
     known, tally = fit.fit_to_volume(given, offsets, scan, Profile, Free(), settings, "cpu")
     assert tally["fitted on a graphics card"] == 0
-    monkeypatch.setattr(fit, "has_card", lambda: True)
-    monkeypatch.setattr(fit, "takes_card", lambda device, needed: True)
+    monkeypatch.setattr(fit, "takes_card", lambda device, needed=0.0: True)
     monkeypatch.setattr(card, "CUDA", torch.device("cpu"))
     found, tally = fit.fit_to_volume(given, offsets, scan, Profile, Free(), settings, "auto")
     assert tally["fitted on a graphics card"] == 1
@@ -108,6 +107,8 @@ def test_a_card_without_room_is_left_and_one_that_is_not_there_is_an_error(scene
     assert not device.takes_card("cpu", needed)
     with pytest.raises(CT2HairError, match=r"run\.device is cuda, but torch"):
         device.takes_card("cuda", needed)
+    with pytest.raises(CT2HairError, match=r"run\.device is cuda, but torch"):
+        fit._potentials(scene[0], "cuda")
     monkeypatch.setattr(device, "_build", lambda: "torch 2.13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (needed, 2 * needed))
