@@ -17,6 +17,11 @@ POINT_PREFIX = "point_"
 """Key prefix of per-point attributes in an npz file; per-strand attributes keep their plain name."""
 
 
+def normalized(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; those of no length stay 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
 @dataclass(frozen=True)
 class Strands:
     """Polylines of hair, root first.

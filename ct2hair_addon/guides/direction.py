@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..head import Head
 from ..settings import GuideSettings
-from ..strands import Strands
+from ..strands import Strands, normalized
 
 TANGENT_SPAN = 3.0
 """mm; the length at an end over which its direction is taken: a voxel or two would be noise."""
@@ -26,11 +26,6 @@ SCALP_HINT = 0.02
 """How much the nearness of an end to the scalp says by itself, against neighbours that say about 1."""
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length 1; those of no length stay 0."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
 def end_tangents(strands: Strands, span: float = TANGENT_SPAN) -> tuple[np.ndarray, np.ndarray]:
     """((N, 3), (N, 3)) unit directions from each strand's first point into it, and from its last point back into it."""
     arc = strands.arc_lengths()
@@ -41,7 +36,7 @@ def end_tangents(strands: Strands, span: float = TANGENT_SPAN) -> tuple[np.ndarr
     near_last = np.maximum(last - np.bincount(index[total[index] - arc <= span], minlength=len(strands)), first)
     out = []
     for at, to in ((first, near_first), (last, near_last)):
-        out.append(unit((strands.points[to] - strands.points[at]).astype(np.float64)))
+        out.append(normalized((strands.points[to] - strands.points[at]).astype(np.float64)))
     return out[0], out[1]
 
 

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
-from ..strands import Strands, offsets_from_counts
-from .direction import TOUCH, end_tangents, unit
+from ..strands import Strands, normalized, offsets_from_counts
+from .direction import TOUCH, end_tangents
 
 REACHES = (1.0, 2.0, 4.0)
 """Multiples of the neighbour radius that are tried in turn: the nearest hair first, thin places last."""
@@ -114,7 +114,7 @@ def course_around(strands: Strands, places: np.ndarray, own: np.ndarray) -> np.n
     found = np.isfinite(distance)
     tangents = tangents[np.where(found, near, 0)]
     along = found & (np.einsum("nkc,nc->nk", tangents, own) > 0.0)
-    return unit(unit(np.einsum("nkc,nk->nc", tangents, along.astype(np.float64))) + OWN * own)
+    return normalized(normalized(np.einsum("nkc,nk->nc", tangents, along.astype(np.float64))) + OWN * own)
 
 
 def follow_to_scalp(
@@ -174,9 +174,9 @@ def walked_back(
         agreement = np.einsum("nkc,nc->nk", tangents[near], onward)
         weight = np.where(found & (agreement > 0.5), agreement * np.exp(-0.5 * (distance / WALK_SPREAD) ** 2), 0.0)
         heard = weight.sum(axis=1) > 1e-3
-        mean = unit(np.einsum("nkc,nk->nc", tangents[near], weight))
+        mean = normalized(np.einsum("nkc,nk->nc", tangents[near], weight))
         going = going[heard]
-        way[going] = unit((1.0 - WALK_TURN) * onward + WALK_TURN * mean)[heard]
+        way[going] = normalized((1.0 - WALK_TURN) * onward + WALK_TURN * mean)[heard]
         path[step, going] = place[heard] - WALK_STEP * way[going]
         taken[going] = step
         height[going] = head.signed_distance(path[step, going])
@@ -184,7 +184,7 @@ def walked_back(
         if glide and len(lowest):
             out = head.closest_scalp(path[step, lowest]).normal.astype(np.float64)
             path[step, lowest] += (low - height[lowest])[:, None] * out
-            way[lowest] = unit(way[lowest] - np.maximum((way[lowest] * out).sum(axis=1), 0.0)[:, None] * out)
+            way[lowest] = normalized(way[lowest] - np.maximum((way[lowest] * out).sum(axis=1), 0.0)[:, None] * out)
         elif not glide:
             going = going[height[going] > low]
     return path, taken, height

@@ -10,11 +10,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..head import Head, ScalpPoints
-from .direction import unit
+from ..strands import normalized
 from .linking import assign
 
 HEIGHT = 1.0
 """mm; knots this far over or under the scalp at most."""
+FEWEST = 50
+"""Fewer knots tell nothing of how many strands there are."""
+CLOSE, CLOSE_SHARE = 4.0, 0.05
+"""voxel; where such a share of knots have another this near, nearer ones were seen as one."""
 NEAREST = 24
 """Knots weighed for each root."""
 ALONG, ACROSS = (1.0, 0.3), (0.55, 0.09)
@@ -35,6 +39,16 @@ def by_the_scalp(knots: np.ndarray, head: Head) -> np.ndarray:
     return knots[np.abs(head.signed_distance(knots)) < HEIGHT] if len(knots) else knots
 
 
+def strands_by_knots(knots: np.ndarray | None, head: Head, spacing: float) -> tuple[int, bool]:
+    """(how many strands the `knots` (K, 3) mm of a scan of `spacing` mm tell of, 0 for none; bool whether some of these may
+    be two in one)."""
+    knots = by_the_scalp(np.zeros((0, 3)) if knots is None else knots, head)
+    if len(knots) < FEWEST:
+        return 0, True
+    apart = cKDTree(knots).query(knots, k=2, workers=-1)[0][:, 1]
+    return len(knots), bool(np.quantile(apart, CLOSE_SHARE) < CLOSE * spacing)
+
+
 def tie_to_knots(
     found: ScalpPoints, course: np.ndarray, hidden: np.ndarray, knots: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +63,7 @@ def tie_to_knots(
     if not len(knots) or not len(roots):
         return roots, np.full(len(roots), -1)
     normal = found.normal.astype(np.float64)
-    along = unit(course - normal * (course * normal).sum(axis=1, keepdims=True))
+    along = normalized(course - normal * (course * normal).sum(axis=1, keepdims=True))
     across = np.cross(normal, along)
     spread = np.stack([np.hypot(known, share * hidden) for known, share in (ALONG, ACROSS)], axis=1)
     tree, short = cKDTree(knots), hidden <= SHORT
@@ -82,5 +96,5 @@ def chosen_knots(row: np.ndarray, knot: np.ndarray, cost: np.ndarray, roots: int
     row, knot, cost (J,): which of the `knots` each root may have, rows ascending, each pair once.
     """
     chosen = np.full(max(roots, knots), -1, np.int64)
-    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, LOOSE, chosen)
+    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, (LOOSE,), chosen)
     return chosen[:roots]

@@ -2,7 +2,8 @@
 
 A trace ends where strands touch and goes on, under another name, where they part. Every tip end is held against the root
 ends that lie on its course; a joint costs what it bends more than hair does, what it bridges, and what the scan doesn't back.
-The cheapest set of joints in which no end is used twice is an assignment problem, solved exactly.
+The cheapest set of joints in which no end is used twice is an assignment problem, solved exactly. What it costs to leave a tip
+loose says how many strands there are; where the knots of the hairnet tell that, it is as low as leaves no more of them.
 """
 
 from __future__ import annotations
@@ -54,7 +55,11 @@ PER_CUT = 0.1
 """Cost of a voxel that is cut off a trace: at a fifth of it nearly any bend was dearer, and a tied wig lost a tenth of its
 hair."""
 LOOSE_END = 30.0
-"""Cost of a tip that goes on nowhere: joints dearer than this are not made."""
+"""Cost of a tip that goes on nowhere, where it is not known how many strands there are: dearer joints are not made."""
+LOOSE_ENDS = (12.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0)
+"""Those that are tried in turn where it is known. Lower ones break good joints, higher ones make none but bad ones."""
+SPARE = 0.02
+"""Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
 STEP = 1.0
 """voxel between the points of a joint."""
 
@@ -180,20 +185,23 @@ def link_segments(
     density: BrickVolume,
     strand: float,
     progress: Progress = silent,
+    known: int = 0,
+    at_least: bool = False,
 ) -> tuple[Strands, np.ndarray, np.ndarray, dict[str, int]]:
     """Chains of directed pieces of segments (mm, scan frame, root end first).
 
     rooted: (P,) bool, pieces whose first point is a root on the scalp: nothing goes on into them. density: the scan; strand:
-    a lone strand's density on its centre line as trilinear reads see it. Returns (chains, (C,) bool rooted, (C,) float32 mm
-    bridged in each, tally).
+    a lone strand's density on its centre line as trilinear reads see it. known: how many strands there are, or are `at_least`;
+    0 where nobody knows. Returns (chains, (C,) bool rooted, (C,) float32 mm bridged in each, tally).
     """
     voxel, lines, onward = density.spacing, pieces.strands, pieces.onward
     count = len(lines)
     rooted = np.asarray(rooted, bool)
     if count < 2:
         return lines, rooted, np.zeros(count, np.float32), {"segments joined": 0}
-    joints = _candidates(lines, rooted, onward, density, strand, part(progress, 0.0, 0.5))
-    following, cut = _assigned(count, joints)
+    prices = tuple(price for price in LOOSE_ENDS if price <= LOOSE_END or not at_least) if known else (LOOSE_END,)
+    joints = _candidates(lines, rooted, onward, density, strand, prices[-1], part(progress, 0.0, 0.5))
+    following, cut, price = _assigned(count, joints, prices, int((1.0 + SPARE) * known))
     progress(0.9, 1.0)
     following, broken = _without_rings(following, joints)
     chain, position, length = _chains(following)
@@ -205,6 +213,7 @@ def link_segments(
         "cuts of segments: an end beside them, or a kink": len(pieces.parent) - len(np.unique(pieces.parent)),
         "cuts that were healed": int(healed.sum()),
         "joints weighed": len(joints.cost),
+        "dearest joint allowed": round(price),
         "joints made": int(((following >= 0) & ~healed).sum()),
         "joints undone: they closed a ring": broken,
         "strands after joining": len(offsets) - 1,
@@ -311,9 +320,15 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
 
 
 def _candidates(
-    lines: Strands, rooted: np.ndarray, onward: np.ndarray, density: BrickVolume, strand: float, progress: Progress
+    lines: Strands,
+    rooted: np.ndarray,
+    onward: np.ndarray,
+    density: BrickVolume,
+    strand: float,
+    dearest: float,
+    progress: Progress,
 ) -> _Joints:
-    """All joints worth weighing, the cheapest for each pair; those that heal a cut leave nothing off."""
+    """All joints no dearer than `dearest`, the cheapest for each pair; those that heal a cut leave nothing off."""
     voxel, count = density.spacing, len(lines)
     best = _healed(lines, onward, density, strand)
     number, steps = 0, len(CUTS) ** 2
@@ -349,7 +364,7 @@ def _candidates(
                 density.origin / voxel, np.float32(strand), cost,
             )  # fmt: skip
             cost += PER_CUT * (cut + root_cut)
-            kept = cost < LOOSE_END
+            kept = cost < dearest
             left = np.full((int(kept.sum()), 2), (round(cut / STEP), round(root_cut / STEP)), np.int16)
             best = _cheaper(best, (pair[kept], left, cost[kept]))
     pair, cut, cost = best
@@ -443,32 +458,44 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
         cost[n] = best + PER_VOXEL * gap + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 
-def _assigned(count: int, joints: _Joints) -> tuple[np.ndarray, np.ndarray]:
-    """(following (N,): the piece that each goes on in, -1 for none; cut (N, 2): points left off its root and its tip) at the
-    least cost."""
+def _assigned(count: int, joints: _Joints, prices: tuple[float, ...], known: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """(following (N,): the piece that each goes on in, -1 for none; cut (N, 2): points left off its root and its tip; the price
+    of a loose tip) at the least cost: at the first of `prices` that leaves no more than `known` tips loose, or the last."""
     following, cut = np.full(count, -1, np.int64), np.zeros((count, 2), np.int64)
     if not len(joints.cost):
-        return following, cut
+        return following, cut, prices[0]
     starts = np.searchsorted(joints.tip, np.arange(count + 1))
-    assign(starts, joints.root, joints.cost, LOOSE_END, following)
+    price = assign(starts, joints.root, joints.cost, prices, following, known)
     tip = np.flatnonzero(following >= 0)
     root = following[tip]
     key = joints.tip * count + joints.root
     chosen = joints.cut[np.searchsorted(key, tip * count + root)]
     cut[tip, 1], cut[root, 0] = chosen[:, 0], chosen[:, 1]
-    return following, cut
+    return following, cut, price
 
 
-def assign(starts: np.ndarray, columns: np.ndarray, costs: np.ndarray, loose: float, chosen: np.ndarray) -> None:
-    """Fill `chosen` (R,) int64: each row's column, or -1, at the least sum of costs, `loose` for a row without one.
+def assign(
+    starts: np.ndarray, columns: np.ndarray, costs: np.ndarray, prices: tuple[float, ...], chosen: np.ndarray, most: int = 0
+) -> float:
+    """Fill `chosen` (R,) int64: each row's column, or -1, at the least sum of costs, a price for a row without one.
 
-    Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`, none below 0. Shortest augmenting paths over
+    Row r may have the columns `columns[starts[r]:starts[r + 1]]`, at `costs`, none below 0. Of the rising `prices` the first
+    that leaves no more than `most` rows without a column is taken, else the last, and returned. Shortest augmenting paths over
     reduced costs (Jonker and Volgenant 1987); each search ends where leaving somebody loose is cheapest, so it stays among
-    neighbours, and looks at a row's columns, cheapest first, no farther than its end may lie.
+    neighbours, and looks at a row's columns, cheapest first, no farther than its end may lie. What is best at one price is
+    where the next one starts: only rows without a column are looked at again.
     """
     order = np.empty(len(costs), np.int32 if len(costs) < 2**31 else np.int64)
     _by_cost(starts, costs, order)
-    _assign(starts, columns[order].astype(np.int32), costs[order], loose, chosen)
+    columns, costs = columns[order].astype(np.int32), costs[order]
+    chosen[:] = -1
+    owner = np.full(len(chosen), -1, np.int64)
+    row_price, column_price = np.zeros(len(chosen)), np.zeros(len(chosen))  # of columns none is above 0
+    for price in prices:
+        _assign(starts, columns, costs, price, chosen, owner, row_price, column_price)
+        if np.count_nonzero(chosen < 0) <= most:
+            break
+    return price
 
 
 @numba.njit(cache=True, parallel=True)
@@ -480,14 +507,15 @@ def _by_cost(starts, costs, order):
 
 
 @numba.njit(cache=True)
-def _assign(starts, columns, costs, loose, chosen):
-    """`assign` of joints that are sorted by row and cost."""
+def _assign(starts, columns, costs, loose, chosen, owner, row_price, column_price):
+    """`assign` of joints that are sorted by row and cost, going on from what was best where `loose` was less.
+
+    owner (R,): each column's row, -1 for none; row_price, column_price (R,): what costs are reduced by.
+    """
     rows = len(chosen)
-    owner = np.full(rows, -1, np.int64)
-    row_price, column_price = np.zeros(rows), np.zeros(rows)  # of columns none is above 0
     distance, before = np.empty(rows), np.empty(rows, np.int64)
     seen, done = np.full(rows, -1, np.int64), np.full(rows, -1, np.int64)
-    for first in range(rows):
+    for first in np.flatnonzero(chosen < 0):
         heap = [(0.0, np.int64(-1)) for _ in range(0)]
         scanned = [np.int64(0) for _ in range(0)]
         row, far = first, 0.0

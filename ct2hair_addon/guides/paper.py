@@ -16,9 +16,8 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, part, silent
 from ..settings import GuideSettings
-from ..strands import Strands, concatenate, offsets_from_counts
+from ..strands import Strands, concatenate, normalized, offsets_from_counts
 from ..volume.grid import BRICK, BrickVolume
-from .direction import unit
 from .seeds import _hash
 
 BANDWIDTH = 1.0
@@ -368,7 +367,7 @@ def _connected(strands: Strands, head: Head, settings: GuideSettings) -> tuple[n
     (N, 3) the scalp's nearest point."""
     first = strands.offsets[:-1]
     near = head.closest_scalp(strands.roots)
-    direction = unit(strands.points[np.minimum(first + 1, strands.offsets[1:] - 1)] - strands.points[first])
+    direction = normalized(strands.points[np.minimum(first + 1, strands.offsets[1:] - 1)] - strands.points[first])
     steep = (near.normal * direction).sum(axis=1) >= np.cos(np.radians(settings.scalp_angle))
     return (near.distance <= settings.scalp_reach) & steep, near.position
 
@@ -397,8 +396,8 @@ def grow_poor(poor: Strands, fine: Strands, head: Head, settings: GuideSettings)
     has0, has1 = np.isfinite(gap0), np.isfinite(gap1)
     p0, p1 = np.where(has0, p0, 0), np.where(has1, p1, 0)
     first, last = poor.offsets[:-1], poor.offsets[1:] - 1
-    s0 = unit(poor.points[first + 1] - poor.points[first])
-    s1 = unit(poor.points[last - 1] - poor.points[last])
+    s0 = normalized(poor.points[first + 1] - poor.points[first])
+    s1 = normalized(poor.points[last - 1] - poor.points[last])
     dot0, dot1 = (s0 * growing[p0]).sum(axis=1), (s1 * growing[p1]).sum(axis=1)
     disagree = has0 & has1 & (dot0 < 0) & (dot1 < 0)
     # where only the other end has a fine strand near, that one says which way the segment runs

@@ -7,9 +7,9 @@ import numpy as np
 
 from ..head import Head
 from ..progress import Progress, silent
-from ..strands import Strands, offsets_from_counts
+from ..strands import Strands, normalized, offsets_from_counts
 from ..volume.strand_signal import outward
-from .direction import end_tangents, unit
+from .direction import end_tangents
 from .free_knots import lead_to_free_knots
 from .growing import course_around, joined
 from .knots import SHORT, by_the_scalp, tie_to_knots
@@ -66,7 +66,7 @@ def _beside(strands: Strands, head: Head, knots: np.ndarray, followed: np.ndarra
     depth = np.maximum(head.signed_distance(ends), 0.0).astype(np.float64)
     course = course_around(strands, ends, forward)
     sine = (course * normal).sum(axis=1)
-    along = unit(course - sine[:, None] * normal)
+    along = normalized(course - sine[:, None] * normal)
     sine = np.clip(sine, FLATTEST, 1.0)
     hidden = np.minimum(FOLLOWED_BACK * depth * np.sqrt(1.0 - sine**2) / sine, HIDDEN)
     found = head.closest_scalp(ends - hidden[:, None] * along - depth[:, None] * normal)
@@ -82,7 +82,7 @@ def _led(strands: Strands, head: Head, place: np.ndarray) -> Strands:
     ends = strands.roots.astype(np.float64)
     root = head.closest_scalp(place)
     gap = np.linalg.norm(root.position - ends, axis=1)
-    leaving = unit(forward + 0.7 * root.normal)
+    leaving = normalized(forward + 0.7 * root.normal)
     counts = np.maximum(np.ceil(gap / ROOT_STEP).astype(np.int64), 1)
     offsets = offsets_from_counts(counts)
     index = np.repeat(np.arange(len(strands)), counts)

@@ -15,6 +15,7 @@ from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor
 from .direction import fine_ends, signs
 from .growing import follow_to_scalp, grow_to_root
+from .knots import strands_by_knots
 from .linking import cut_segments, link_segments, meeting_ends
 from .paper import paper_guides
 from .profile import strand_profile
@@ -146,10 +147,11 @@ def root_segments(
         fine = pieces.ends(fine)
         value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand))
         progress(0.3, 1.0)
+        known, merged = strands_by_knots(knots if settings.knots else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
-            pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5)
+            pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5), known, merged
         )
-        tally |= joints
+        tally |= {"strands by the knots": known} | joints
     else:
         value = signs(segments, fine, head, settings)
         directed, rooted, bridged = segments.reversed(value < 0), fine != 0, np.zeros(len(segments), np.float32)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from ..strands import normalized
 from .flatten import scalp_patch, unwrap
 from .mesh import HeadMesh, boundary_loops, face_areas
 from .nearest import CHUNK, TriangleTree, nearest_one, winding_one
@@ -177,16 +178,16 @@ class Head:
         face = np.asarray(face)
         weights = np.asarray(bary, np.float64)[:, :, None]
         corner = self.mesh.faces[face]
-        normal = _unit((self.normals[corner] * weights).sum(axis=1))
+        normal = normalized((self.normals[corner] * weights).sum(axis=1))
         tangent = (self._tangents[corner] * weights).sum(axis=1)
-        tangent = _unit(tangent - (tangent * normal).sum(axis=1, keepdims=True) * normal)
+        tangent = normalized(tangent - (tangent * normal).sum(axis=1, keepdims=True) * normal)
         return np.stack([tangent, np.cross(normal, tangent), normal], axis=1).astype(np.float32)
 
     def _at(self, face, bary, distance) -> ScalpPoints:
         corner = self.mesh.faces[np.maximum(face, 0)]
         weights = np.where(face[:, None] >= 0, bary, np.nan)[:, :, None]
         position = (self.mesh.vertices[corner] * weights).sum(axis=1)
-        normal = _unit((self.normals[corner] * weights).sum(axis=1))
+        normal = normalized((self.normals[corner] * weights).sum(axis=1))
         uv = (self.mesh.uv[corner] * weights).sum(axis=1)
         return ScalpPoints(
             distance.astype(np.float32),
@@ -196,10 +197,6 @@ class Head:
             weights[:, :, 0].astype(np.float32),
             uv.astype(np.float32),
         )
-
-
-def _unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
 def closed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

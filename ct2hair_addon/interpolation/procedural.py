@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from ..strands import Strands
+from ..strands import Strands, normalized
 
 KINDS = ("rod", "wave", "kink", "helix", "coil", "noise")
 """What a strand is: bent only; a flat wave; a flat wave with corners; a drawn-out helix; a tight one; bent at random."""
@@ -77,7 +77,7 @@ def _drawn(kind: np.ndarray, generator: np.random.Generator, points: int) -> np.
 
     tilt = np.radians(80.0) * np.sqrt(generator.random(count))
     start = _spherical(tilt, generator.uniform(0.0, 2.0 * np.pi, count))
-    pull = _unit(generator.normal(size=(count, 3)))
+    pull = normalized(generator.normal(size=(count, 3)))
     # bending over the strand's length, radians: from stiff to limp
     weight = generator.uniform(0.0, 6.0, count) * (generator.random(count) < 0.85) / length
     onset = length * generator.uniform(0.02, 0.6, count)
@@ -121,7 +121,7 @@ def _drawn(kind: np.ndarray, generator: np.random.Generator, points: int) -> np.
     strength = np.where(name == "noise", generator.uniform(0.2, 1.2, count), generator.uniform(0.0, 0.4, count))
     cycles = np.exp(generator.uniform(np.log(0.4), np.log(7.0), (count, NOISE_BANDS)))
     sway = np.empty((count, NOISE_BANDS, 5))
-    sway[:, :, :3] = _unit(generator.normal(size=(count, NOISE_BANDS, 3)))
+    sway[:, :, :3] = normalized(generator.normal(size=(count, NOISE_BANDS, 3)))
     sway[:, :, :3] *= (strength[:, None] * np.minimum(cycles, 2.5) * generator.random((count, NOISE_BANDS)) * 2.0)[:, :, None]
     sway[:, :, :3] /= length[:, None, None]
     sway[:, :, 3] = course[:, None] / cycles
@@ -137,10 +137,6 @@ def _drawn(kind: np.ndarray, generator: np.random.Generator, points: int) -> np.
     actual = np.linalg.norm(np.diff(shapes, axis=1), axis=2).sum(axis=1)
     scale = np.where(radius > 0.0, np.clip(length / actual, 0.7, 1.4), length / actual)
     return (shapes * scale[:, None, None]).astype(np.float32)
-
-
-def _unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def _spherical(polar, around):

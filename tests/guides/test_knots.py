@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ct2hair_addon.guides.knots import by_the_scalp, tie_to_knots
+from ct2hair_addon.guides.knots import by_the_scalp, strands_by_knots, tie_to_knots
 from ct2hair_addon.guides.roots import lead_into_scalp
 from ct2hair_addon.head import Head
 from ct2hair_addon.strands import Strands
@@ -85,6 +85,15 @@ def test_without_knots_by_the_scalp_nothing_moves(knots, ball, tied_hair):
     roots, knot = tie_to_knots(found, forward, np.full(len(forward), HIDDEN), knots)
     np.testing.assert_array_equal(roots, found.position)
     assert (knot < 0).all()
+
+
+def test_knots_tell_how_many_strands_there_are_and_where_they_can_not(ball, tied_hair):
+    knots = tied_hair[0]
+    off = ball.closest_scalp(knots).normal * 5.0
+    apart = np.linalg.norm(knots[:, None] - knots[None] + 1e9 * np.eye(len(knots))[:, :, None], axis=2).min(axis=1)
+    for spacing, merged in ((np.quantile(apart, 0.05) / 4.4, False), (np.quantile(apart, 0.05) / 3.6, True)):
+        assert strands_by_knots(np.concatenate([knots, knots + off]), ball, spacing) == (len(knots), merged)
+    assert strands_by_knots(None, ball, 0.4) == strands_by_knots(knots[:20], ball, 0.4) == (0, True)
 
 
 def test_the_lead_starts_at_the_knot(ball, tied_hair):

@@ -8,6 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from ct2hair_addon.evaluation import render_density, strand_peak
+from ct2hair_addon.guides import linking
 from ct2hair_addon.guides.linking import assign, cut_segments, link_segments, meeting_ends
 from ct2hair_addon.strands import Strands
 
@@ -15,12 +16,12 @@ SPACING, BLUR = 0.4, 0.85
 SEEN = strand_peak(BLUR) * BLUR**2 / (BLUR**2 + 1.0 / 6.0)
 
 
-def joined(lines, truth, rooted=()):
+def joined(lines, truth, rooted=(), **known):
     """The chains of directed lines (mm) in a scan of the `truth`; `rooted`: those that begin on the scalp."""
     density = render_density(Strands.from_polylines(truth), SPACING, BLUR)
     pieces = cut_segments(Strands.from_polylines(lines), SPACING)
     fine = np.isin(np.arange(len(lines)), rooted).astype(np.int8)
-    return link_segments(pieces, pieces.ends(fine) != 0, density, SEEN)
+    return link_segments(pieces, pieces.ends(fine) != 0, density, SEEN, **known)
 
 
 def crossing():
@@ -36,14 +37,16 @@ def farthest(chain, truth):
     return np.linalg.norm(chain[:, None] - truth[None], axis=2).min(axis=1).max()
 
 
+@pytest.mark.parametrize("prices", [(20.0,), (2.0, 7.0, 8.0, 20.0)])
 @pytest.mark.parametrize(("rows", "seed"), [(6, 0), (40, 1), (400, 2), (3000, 3)])
-def test_the_assignment_is_the_cheapest(rows, seed):
-    generator, loose = np.random.default_rng(seed), 20.0
+def test_the_assignment_is_the_cheapest(rows, seed, prices):
+    """At once, and going on from what was cheapest when a row without a column cost less."""
+    generator, loose = np.random.default_rng(seed), prices[-1]
     key = np.unique(generator.integers(0, rows * rows, 6 * rows))
     row, column = key // rows, key % rows
     cost = generator.uniform(0, 30, len(key))
-    chosen = np.full(rows, -1, np.int64)
-    assign(np.searchsorted(row, np.arange(rows + 1)), column, cost, loose, chosen)
+    starts, chosen = np.searchsorted(row, np.arange(rows + 1)), np.empty(rows, np.int64)
+    assert assign(starts, column, cost, prices, chosen) == loose
     has = np.flatnonzero(chosen >= 0)
     assert len(np.unique(chosen[has])) == len(has)
     found = cost[np.searchsorted(key, has * rows + chosen[has])].sum() + loose * (rows - len(has))
@@ -53,6 +56,29 @@ def test_the_assignment_is_the_cheapest(rows, seed):
     graph = coo_matrix((entries, places), shape=(rows, 2 * rows)).tocsr()
     best = np.asarray(graph[min_weight_full_bipartite_matching(graph)]).sum() - rows
     assert found == pytest.approx(best, rel=1e-9)
+
+
+def test_the_price_of_a_loose_row_is_the_first_that_leaves_few_enough():
+    # row 0 has only a dear column, row 1 a cheap one, row 2 none
+    starts, columns, costs = np.array([0, 1, 2, 2]), np.array([0, 1]), np.array([15.0, 3.0])
+    for most, price, expected in ((3, 2.0, [-1, -1, -1]), (2, 10.0, [-1, 1, -1]), (1, 20.0, [0, 1, -1]), (0, 20.0, [0, 1, -1])):
+        chosen = np.empty(3, np.int64)
+        assert assign(starts, columns, costs, (2.0, 10.0, 20.0), chosen, most) == price
+        assert chosen.tolist() == expected
+
+
+def test_where_it_is_known_how_many_strands_there_are_joints_are_as_dear_as_need_be(monkeypatch):
+    """Three ends that one strand may run through, the second gap longer, farther aside and with a kink."""
+    x = np.arange(0.0, 20.0, 0.25)[:, None]
+    along, bent = x * [1.0, 0, 0], x * [np.cos(0.6), np.sin(0.6), 0]
+    lines = [along, along + [25.75, 1.2, 0.0], bent + [55.5, 4.2, 0.0]]
+    for known, price in ((3, 12), (2, 15), (1, 25)):
+        chains, _, _, tally = joined(lines, lines, known=known)
+        assert len(chains) == known and tally["dearest joint allowed"] == price
+    assert len(joined(lines, lines)[0]) == 1, "where it is not known, the usual price"
+    monkeypatch.setattr(linking, "LOOSE_END", 20.0)
+    assert len(joined(lines, lines, known=1)[0]) == 1
+    assert len(joined(lines, lines, known=1, at_least=True)[0]) == 2, "there may be more strands: no dearer than usual"
 
 
 def test_a_gap_is_bridged_along_the_bend():

@@ -99,6 +99,16 @@ def test_a_helix_is_followed():
     assert len(found) > 0.8 * np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
 
 
+@pytest.mark.parametrize("radius", [11.0, 14.0])
+def test_a_curl_keeps_its_radius(radius):
+    """Following and smoothing alone ran a fifth of a voxel inside of it."""
+    t = np.linspace(0, 4 * np.pi, int(4.2 * np.pi * radius))
+    curve = np.stack([32 + radius * np.cos(t), 32 + radius * np.sin(t), 8 + 3.5 * t], 1)
+    found = max(traced(scan([curve], (64, 64, 64), snr=4.0))[0], key=len)[8:-8]
+    assert len(found) > 100
+    assert np.hypot(found[:, 0] - 32, found[:, 1] - 32).mean() == pytest.approx(radius, abs=0.1)
+
+
 def test_noise_alone_gives_no_strand():
     lines, _, _ = traced(scan([straight((8, 8, 8), (8, 8, 56))], (64, 64, 64), snr=4.0))
     assert len(lines) == 1

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...strands import Strands
+from ...strands import Strands, normalized
 from .growth import clump, curl, cut, grow, settle
-from .person import Person, strands_of, unit_rows, wisps
+from .person import Person, strands_of, wisps
 
 WISPS, LOCKS = 170, 1100
 """Wisps of the large and the small kind, at most: some 20 and 8 mm wide at the scalp."""
@@ -61,7 +61,7 @@ def straight(who: Person) -> Growth:
     count = len(who.roots)
     ones = np.ones(count)
     return Growth(
-        start=unit_rows(who.normals + 0.0),
+        start=normalized(who.normals + 0.0),
         comb=who.along_scalp(np.tile([0.0, 0.0, -1.0], (count, 1))),
         comb_length=45.0 * ones,
         gravity=0.035 * ones,
@@ -88,7 +88,7 @@ def comb_from_parting(who: Person, x: float, back: float, sway: np.ndarray) -> t
     from_crown = who.roots - who.crown
     # behind the crown, hair radiates from it
     behind = np.clip((from_crown[:, 1] / who.unit + 10.0) / 30.0, 0.0, 1.0)[:, None]
-    direction = aside * (1.0 - behind) + unit_rows(from_crown * [1.0, 1.0, 0.6]) * 1.2 * behind
+    direction = aside * (1.0 - behind) + normalized(from_crown * [1.0, 1.0, 0.6]) * 1.2 * behind
     return who.along_scalp(direction), side
 
 
@@ -98,7 +98,7 @@ def comb_from_crown(who: Person, turn: float = 0.25) -> np.ndarray:
     around = np.cross(who.normals, away)
     near = np.exp(-np.linalg.norm(away, axis=1, keepdims=True) / (45.0 * who.unit))
     return who.along_scalp(
-        unit_rows(away) + around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9) * (turn + near)
+        normalized(away) + around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9) * (turn + near)
     )
 
 
@@ -120,7 +120,7 @@ def styled(who: Person, growth: Growth, generator: np.random.Generator, side: np
         wander[:, 2 + n, 1] = large.uniform(generator, 0.0, 2.0 * np.pi) + 0.4 * generator.normal(size=count)
 
     spread = 0.16 * large.shared(generator, 3) + 0.10 * small.shared(generator, 3) + 0.05 * generator.normal(size=(count, 3))
-    comb = unit_rows(growth.comb + spread)
+    comb = normalized(growth.comb + spread)
     length = growth.length * np.exp(0.05 * large.shared(generator) + 0.06 * small.shared(generator))
     length = length * (1.0 + 0.05 * generator.normal(size=count)).clip(0.75, 1.25) * np.where(fly, 0.85, 1.0)
     layer = growth.layer * np.exp(0.12 * large.shared(generator) + 0.1 * small.shared(generator))
@@ -129,7 +129,7 @@ def styled(who: Person, growth: Growth, generator: np.random.Generator, side: np
     courses = np.empty((count, growth.points, 3))
     grow(
         who.roots,
-        unit_rows(growth.start + 0.5 * comb + 0.15 * small.shared(generator, 3)),
+        normalized(growth.start + 0.5 * comb + 0.15 * small.shared(generator, 3)),
         comb,
         growth.comb_length * unit,
         growth.gravity / unit,
@@ -164,7 +164,7 @@ def styled(who: Person, growth: Growth, generator: np.random.Generator, side: np
             + growth.own_phase * generator.normal(size=count),
             handed * growth.flat,
             np.full(count, growth.ramp * unit),
-            unit_rows(large.shared(generator, 3) * across + np.cross(who.normals, [0.0, 0.0, 1.0]) + 1e-3),
+            normalized(large.shared(generator, 3) * across + np.cross(who.normals, [0.0, 0.0, 1.0]) + 1e-3),
             wound,
         )
         courses = wound
@@ -223,7 +223,7 @@ def pixie(who: Person, seed: int) -> Strands:
     place = (who.roots - who.middle) / who.unit
     top = np.clip((who.height - 0.55) / 0.3, 0.0, 1.0)
     sweep = who.along_scalp(np.tile([0.75, -0.75, -0.15], (len(place), 1)))
-    growth.comb = unit_rows(
+    growth.comb = normalized(
         comb_from_crown(who) * (1.15 - top * who.forward)[:, None] + sweep * (top * who.forward * 1.6)[:, None]
     )
     growth.length = 26.0 + 20.0 * who.height + 36.0 * top * who.forward
@@ -285,11 +285,11 @@ def jewfro(who: Person, seed: int) -> Strands:
     """A ball of tight coils of 4 to 6 mm radius standing out all round."""
     generator = _random(who, seed)
     growth = straight(who)
-    away = unit_rows(who.roots - who.middle + [0.0, 0.0, 8.0 * who.unit])
+    away = normalized(who.roots - who.middle + [0.0, 0.0, 8.0 * who.unit])
     # a ball, not a peak over the forehead
-    away = unit_rows(away + np.array([0.0, 0.35, 0.55]) * np.clip(2.0 * who.forward - 1.0, 0.0, 1.0)[:, None])
-    growth.start = unit_rows(who.normals + away)
-    growth.comb = unit_rows(away + 0.35 * who.normals + [0.0, 0.0, 0.05])
+    away = normalized(away + np.array([0.0, 0.35, 0.55]) * np.clip(2.0 * who.forward - 1.0, 0.0, 1.0)[:, None])
+    growth.start = normalized(who.normals + away)
+    growth.comb = normalized(away + 0.35 * who.normals + [0.0, 0.0, 0.05])
     growth.comb_length = growth.comb_length * 2.0
     growth.gravity = growth.gravity * 0.12
     growth.length = 52.0 + 14.0 * who.height - 8.0 * who.forward
@@ -326,10 +326,10 @@ def blowout(who: Person, seed: int) -> Strands:
     generator = _random(who, seed)
     growth = straight(who)
     parted, side = comb_from_parting(who, 14.0, 0.9, 3.0 * generator.normal(size=len(who.roots)))
-    growth.comb = unit_rows(
+    growth.comb = normalized(
         parted + who.along_scalp(np.tile([0.0, 1.0, 0.35], (len(parted), 1))) * (0.9 * who.forward)[:, None]
     )
-    growth.start = unit_rows(who.normals * 1.4 + [0.0, 0.0, 0.4])
+    growth.start = normalized(who.normals * 1.4 + [0.0, 0.0, 0.4])
     growth.comb_length = growth.comb_length * 1.4
     growth.length = 175.0 + 50.0 * who.height
     growth.layer = 9.0 + 20.0 * who.height
@@ -348,12 +348,12 @@ def wings(who: Person, seed: int) -> Strands:
     growth = straight(who)
     parted, side = comb_from_parting(who, 0.0, 0.75, 2.0 * generator.normal(size=len(who.roots)))
     growth.comb = parted
-    growth.start = unit_rows(who.normals + 0.5 * parted)
+    growth.start = normalized(who.normals + 0.5 * parted)
     growth.comb_length = growth.comb_length * 1.3
     growth.length = 110.0 + 60.0 * who.height - 20.0 * who.forward
     growth.layer = 7.0 + 17.0 * who.height
     outward = who.outward()
-    growth.tip = unit_rows(outward + [0.0, 0.5, 0.45]) * (0.45 + 0.5 * who.forward)[:, None]
+    growth.tip = normalized(outward + [0.0, 0.5, 0.45]) * (0.45 + 0.5 * who.forward)[:, None]
     growth.tip_length = growth.tip_length * (45.0 + 15.0 * who.forward)
     growth.gravity = growth.gravity * 1.1
     growth.sway, growth.stray, growth.wisp, growth.lock = 0.003, 0.3, 0.5, 0.55

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...head import Head, HeadMesh
-from ...strands import Strands, offsets_from_counts
+from ...strands import Strands, normalized, offsets_from_counts
 from ..distance_field import DistanceField
 
 FIELD_STEP = 1.5
@@ -72,17 +72,13 @@ class Person:
     def along_scalp(self, vectors: np.ndarray) -> np.ndarray:
         """(N, 3) unit: vectors (N, 3) laid into the tangent planes at the roots."""
         flat = vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals
-        return unit_rows(flat)
+        return normalized(flat)
 
     def outward(self) -> np.ndarray:
         """(N, 3) unit, horizontal: away from the head's axis."""
         away = self.roots - self.middle
         away[:, 2] = 0.0
-        return unit_rows(away)
-
-
-def unit_rows(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+        return normalized(away)
 
 
 @dataclass(frozen=True, eq=False)

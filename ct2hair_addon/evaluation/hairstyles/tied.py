@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...strands import Strands
+from ...strands import Strands, normalized
 from .growth import CLEARANCE, bundle, clump, drape, grow, pull, settle
-from .person import Person, strands_of, unit_rows, wisps
+from .person import Person, strands_of, wisps
 
 FULL_HEAD = 100_000
 """Strands on a human head, which all the room is reckoned for."""
@@ -60,7 +60,7 @@ def gather(who: Person, elevation: float, generator: np.random.Generator, taut: 
     axes = np.array([[1.0, 0.0, 0.0], [0.0, -np.sin(up), np.cos(up)], [0.0, np.cos(up), np.sin(up)]])
     reach = who.roots - who.middle
     radius = float(np.linalg.norm(reach, axis=1).mean())
-    seen = unit_rows(reach) @ axes.T
+    seen = normalized(reach) @ axes.T
     from_tie = np.arccos(np.clip(seen[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(seen[:, 1], seen[:, 0])
 
@@ -130,8 +130,8 @@ def _loose(who: Person, tie: Tie, loose: np.ndarray, points: int, generator: np.
     out = way[row, low] + (at - low)[..., None] * (way[row, low + 1] - way[row, low])
     # they rise over the others, sideways as well, and sway
     s = np.linspace(0.0, 1.0, points)[:, None]
-    away = unit_rows(out - who.middle)
-    along = unit_rows(np.gradient(out, axis=1))
+    away = normalized(out - who.middle)
+    along = normalized(np.gradient(out, axis=1))
     aside = np.cross(away, along)
     rise = generator.uniform(1.0, 4.0, (count, 1, 1)) * np.where(baby, 1.0, 1.6)[:, None, None]
     lean = generator.normal(size=(count, 1, 1)) * np.where(baby, 4.0, 5.0)[:, None, None]
@@ -170,11 +170,11 @@ def _along(field, start: np.ndarray, ray: np.ndarray) -> float:
 
 def _frames(centre: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(K, Q, 3) twice: directions across centre lines (K, Q, 3), carried along without twist from `first` (3,)."""
-    tangent = unit_rows(np.gradient(centre, axis=1))
+    tangent = normalized(np.gradient(centre, axis=1))
     one = np.empty_like(centre)
     carried = np.broadcast_to(first, centre[:, 0].shape)
     for q in range(centre.shape[1]):  # along a handful of lines; each point needs the one before
-        carried = unit_rows(carried - (carried * tangent[:, q]).sum(axis=1, keepdims=True) * tangent[:, q])
+        carried = normalized(carried - (carried * tangent[:, q]).sum(axis=1, keepdims=True) * tangent[:, q])
         one[:, q] = carried
     return one, np.cross(one, tangent)
 
@@ -195,7 +195,7 @@ def _hanging(who: Person, tie: Tie, rise: float, stiff: float, length: float, cl
     grow(
         tie.centre[None],
         tie.axes[2:],
-        unit_rows(tie.axes[2:] + [0.0, 0.0, rise]),
+        normalized(tie.axes[2:] + [0.0, 0.0, rise]),
         stiff * unit * one,
         one / (1.05 * stiff * unit),
         0.6 * stiff * unit * one,
