@@ -74,6 +74,7 @@ def find_segments(
     found = trace_segments(
         residual, course, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.15, 1.0)
     )
+    del residual  # points in millimetres are made in float64: together they were of the peak of memory
     return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
 
 

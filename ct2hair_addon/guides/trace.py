@@ -46,8 +46,8 @@ SURE = 1 / 3
 BESIDE, EVEN = 1.0, 16
 """voxel to both sides of a path, in the plane of its bend, where the density is compared, and points before and behind over
 which that is summed: how far a path runs inside of its curl."""
-WIDENINGS = 2
-"""How often that is done: neighbours make it look less."""
+WIDENINGS, WIDEST = 2, 0.25
+"""How often that is done, since neighbours make it look less; and how far a path is moved out each time at most, voxel."""
 SUPPORT = 0.4
 """Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
 SHARPNESS = 0.06
@@ -224,7 +224,7 @@ def smoothed(path, widths, most):
 
 @numba.njit(cache=True, nogil=True)
 def _widened(table, bricks, path, step, seen, blur):
-    """Move a smoothed `path` (n, 3) in its bends to where the ridge of the density runs, in place.
+    """Move a smoothed `path` (n, 3) in its bends out to where the ridge of the density runs, in place.
 
     Following lags and smoothing cuts corners: a path runs inside of its curl, by a fifth of a voxel at a radius of a dozen. How
     far is read from the density to the inner and to the outer side, summed along the path, since at one place alone it would
@@ -233,38 +233,35 @@ def _widened(table, bricks, path, step, seen, blur):
     size = len(path)
     if size <= 2 * BEND_SPAN:
         return
-    aside = np.zeros((size, 3))
+    inward = np.zeros((size, 3))
     inner, outer = np.zeros(size + 1), np.zeros(size + 1)  # summed from the first point on
     noise = LEAST_BEND * (BEND_SPAN * step) ** 2
     for m in range(size):
         at = min(max(m, BEND_SPAN), size - 1 - BEND_SPAN)
-        bent = square = along = length = 0.0
+        before, behind = path[max(m - 2, 0)], path[min(m + 2, size - 1)]
+        along = length = square = 0.0
         for axis in range(3):
-            t = path[min(m + 2, size - 1), axis] - path[max(m - 2, 0), axis]
-            b = path[at - BEND_SPAN, axis] - 2.0 * path[at, axis] + path[at + BEND_SPAN, axis]
-            aside[m, axis] = b
-            along, length = along + t * b, length + t * t
+            t = behind[axis] - before[axis]
+            inward[m, axis] = path[at - BEND_SPAN, axis] - 2.0 * path[at, axis] + path[at + BEND_SPAN, axis]
+            along, length = along + t * inward[m, axis], length + t * t
         for axis in range(3):
-            t = path[min(m + 2, size - 1), axis] - path[max(m - 2, 0), axis]
-            aside[m, axis] -= along / max(length, 1e-12) * t
-            square += aside[m, axis] ** 2
-        bent = np.sqrt(square)
-        for axis in range(3):
-            aside[m, axis] /= max(bent, 1e-12)
+            inward[m, axis] -= along / max(length, 1e-12) * (behind[axis] - before[axis])
+            square += inward[m, axis] ** 2
+        bent = max(np.sqrt(square), 1e-12)
         x, y, z = float(path[m, 0]), float(path[m, 1]), float(path[m, 2])
-        u, v, w = BESIDE * aside[m, 0], BESIDE * aside[m, 1], BESIDE * aside[m, 2]
+        u, v, w = (BESIDE / bent) * inward[m, 0], (BESIDE / bent) * inward[m, 1], (BESIDE / bent) * inward[m, 2]
         inner[m + 1] = inner[m] + min(density_at(table, bricks, x + u, y + v, z + w) / seen, 1.3)
         outer[m + 1] = outer[m] + min(density_at(table, bricks, x - u, y - v, z - w) / seen, 1.3)
-        share = max(1.0 - (noise / max(bent, 1e-12)) ** 2, 0.0)
         for axis in range(3):
-            aside[m, axis] *= share
+            inward[m, axis] *= max(1.0 - (noise / bent) ** 2, 0.0) / bent
     for m in range(size):
         low, high = max(m - EVEN, 0), min(m + EVEN + 1, size)
         a, b = inner[high] - inner[low], outer[high] - outer[low]
         # of a Gaussian that lies d to one side, values at -s and s differ by their sum times tanh(s d / variance)
-        far = (blur * blur + 1.0 / 6.0) / BESIDE * (a - b) / max(a + b, 1e-6)
+        far = (blur * blur + 1.0 / 6.0) / BESIDE * (b - a) / max(a + b, 1e-6)
+        far = min(max(far, 0.0), WIDEST)
         for axis in range(3):
-            path[m, axis] += far * aside[m, axis]
+            path[m, axis] -= far * inward[m, axis]
 
 
 @numba.njit(cache=True, parallel=True)
