@@ -56,7 +56,7 @@ PER_CUT = 0.1
 hair."""
 LOOSE_END = 30.0
 """Cost of a tip that goes on nowhere, where it is not known how many strands there are: dearer joints are not made."""
-LOOSE_ENDS = (12.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0)
+LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
 """Those that are tried in turn where it is known. Lower ones break good joints, higher ones make none but bad ones."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
