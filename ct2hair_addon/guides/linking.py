@@ -57,7 +57,8 @@ hair."""
 LOOSE_END = 30.0
 """Cost of a tip that goes on nowhere, where it is not known how many strands there are: dearer joints are not made."""
 LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
-"""Those that are tried in turn where it is known. Lower ones break good joints, higher ones make none but bad ones."""
+"""Those tried in turn where it is known; the first alone where there may be more strands. Lower ones break good joints, higher
+ones make none but bad ones."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
 STEP = 1.0
@@ -199,7 +200,7 @@ def link_segments(
     rooted = np.asarray(rooted, bool)
     if count < 2:
         return lines, rooted, np.zeros(count, np.float32), {"segments joined": 0}
-    prices = tuple(price for price in LOOSE_ENDS if price <= LOOSE_END or not at_least) if known else (LOOSE_END,)
+    prices = (LOOSE_ENDS[:1] if at_least else LOOSE_ENDS) if known else (LOOSE_END,)
     joints = _candidates(lines, rooted, onward, density, strand, prices[-1], part(progress, 0.0, 0.5))
     following, cut, price = _assigned(count, joints, prices, int((1.0 + SPARE) * known))
     progress(0.9, 1.0)
