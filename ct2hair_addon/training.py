@@ -18,7 +18,7 @@ from .errors import CT2HairError
 from .evaluation import STYLES, hairstyle
 from .head import Head, template_head
 from .interpolation.procedural import KINDS, procedural_strands
-from .strands import Strands
+from .strands import Strands, normalized
 
 POINTS = 256
 FEWEST = 2500
@@ -137,8 +137,7 @@ def decoding_errors(truth: Examples, made: np.ndarray) -> dict:
 
 def turns(shapes: np.ndarray) -> np.ndarray:
     """(N,): how often each strand (N, P, 3) turns round: the sum of its bends over a full turn."""
-    moves = np.diff(shapes, axis=1)
-    moves = moves / np.maximum(np.linalg.norm(moves, axis=2, keepdims=True), 1e-9)
+    moves = normalized(np.diff(shapes, axis=1))
     return np.arccos(np.clip((moves[:, 1:] * moves[:, :-1]).sum(axis=2), -1.0, 1.0)).sum(axis=1) / (2.0 * np.pi)
 
 

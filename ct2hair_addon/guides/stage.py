@@ -139,6 +139,7 @@ def root_segments(
     knots: (K, 3) mm, where strands are tied to the net. floor: mm over the scalp below which the scan shows no hair.
     """
     tally: dict[str, int] = {}
+    knots = knots if settings.knots else None
     fine = fine_ends(segments, head, settings)
     tally["fine segments"] = int((fine != 0).sum())
     tally["poor segments"] = int((fine == 0).sum())
@@ -148,7 +149,7 @@ def root_segments(
         fine = pieces.ends(fine)
         value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand))
         progress(0.3, 1.0)
-        known, merged = strands_by_knots(knots if settings.knots else None, head, spacing)
+        known, merged = strands_by_knots(knots, head, spacing)
         directed, rooted, bridged, joints = link_segments(
             pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5), known, merged
         )
@@ -170,7 +171,7 @@ def root_segments(
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
     made = (bodies.counts - seen.counts)[enough]
-    rooted, tied, late = lead_into_scalp(kept, head, knots if settings.knots else None, made, part(progress, 0.7, 0.85))
+    rooted, tied, late = lead_into_scalp(kept, head, knots, made, part(progress, 0.7, 0.85))
     tally["roots at knots of the net"] = tied
     tally["led to knots that were left"] = late
     progress(0.85, 1.0)

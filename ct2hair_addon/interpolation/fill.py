@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
 from ..settings import InterpolationSettings
-from ..strands import Strands, concatenate
+from ..strands import Strands, concatenate, normalized
 from ..volume import BrickVolume
 from ..volume.strand_signal import outward, support_along
 from .coder import SHAPE_POINTS, Coder, LinearCoder, blend, chosen_coder
@@ -205,8 +205,7 @@ def blend_weights(
 def _directions(shapes: np.ndarray) -> np.ndarray:
     """(N, Q, 3) float32 unit directions of shapes (N, P, 3) at ANGLE_POINTS places along them."""
     step = np.diff(shapes, axis=1)
-    step = step[:, np.linspace(0, step.shape[1] - 1, ANGLE_POINTS).astype(np.int64)]
-    return step / np.maximum(np.linalg.norm(step, axis=2, keepdims=True), 1e-9)
+    return normalized(step[:, np.linspace(0, step.shape[1] - 1, ANGLE_POINTS).astype(np.int64)])
 
 
 def _thinned(guides: Strands, count: int) -> tuple[Strands, dict[str, int]]:

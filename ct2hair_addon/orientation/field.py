@@ -10,7 +10,7 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..settings import OrientationSettings
-from ..strands import Strands
+from ..strands import Strands, normalized
 from ..volume import as_grid, write_grids
 from ..volume.grid import BRICK, UNIT, BrickVolume, gather
 from .eigen import smallest_eigenvector
@@ -65,8 +65,7 @@ class OrientationField:
             held = held[np.sort(np.random.default_rng(0).choice(len(held), most, replace=False, shuffle=False))]
         row, *at = np.unravel_index(held, self.confidence.bricks.shape)
         places = self.direction.to_scan(BRICK * self.direction.brick_index[row].astype(np.int64) + np.stack(at, axis=1))
-        directions = self.direction.bricks[row, *at].astype(np.float32)
-        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        directions = normalized(self.direction.bricks[row, *at].astype(np.float32))
         return places, directions, self.confidence.bricks[row, *at] / np.float32(255.0)
 
     def lines(self, most: int = LINES) -> Strands:

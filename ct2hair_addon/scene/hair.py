@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import HeadError, StrandFileError
 from ..head import Head, HeadMesh
-from ..strands import Strands
+from ..strands import Strands, normalized
 from .attributes import read_attribute, write_attribute
 from .frames import MM
 from .head import SCALP_UV, attach, head_mesh
@@ -132,8 +132,7 @@ def new_lines(new: NewData, name: str, lines: Strands, material: bpy.types.Mater
         raise StrandFileError(f"'{name}' has no line: there is nothing to show")
     curves = _new_curves(new, name, lines)
     write_attribute(curves, "radius", "FLOAT", "POINT", np.full(len(lines.points), 0.5 * MM * diameter))
-    along = lines.points[1::2] - lines.points[::2]
-    directions = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    directions = normalized(lines.points[1::2] - lines.points[::2])
     for key, values in {**lines.strand_attributes, "direction": directions}.items():
         _write_array(curves, key, "CURVE", np.asarray(values))
     curves.materials.append(material)

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from ..progress import Progress, silent
-from ..strands import Strands
+from ..strands import Strands, normalized
 from .grid import BrickVolume, trilinear
 from .structure import SMOOTHING, STRAND_BLUR
 
@@ -203,8 +203,7 @@ def outward(points: np.ndarray, head) -> np.ndarray:
     steps = SLOPE_STEP * np.concatenate([np.eye(3), -np.eye(3)])
     values = head.signed_distance((points[None] + steps[:, None]).reshape(-1, 3).astype(np.float32))
     values = np.asarray(values, np.float64).reshape(6, -1)
-    slope = (values[:3] - values[3:]).T
-    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+    return normalized((values[:3] - values[3:]).T)
 
 
 def support_along(

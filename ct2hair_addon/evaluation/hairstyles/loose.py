@@ -97,9 +97,7 @@ def comb_from_crown(who: Person, turn: float = 0.25) -> np.ndarray:
     away = who.roots - who.crown
     around = np.cross(who.normals, away)
     near = np.exp(-np.linalg.norm(away, axis=1, keepdims=True) / (45.0 * who.unit))
-    return who.along_scalp(
-        normalized(away) + around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9) * (turn + near)
-    )
+    return who.along_scalp(normalized(away) + normalized(around) * (turn + near))
 
 
 def styled(who: Person, growth: Growth, generator: np.random.Generator, side: np.ndarray | None = None) -> Strands:
