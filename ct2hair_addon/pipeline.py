@@ -168,7 +168,7 @@ class _Job:
             field.save(self.out / "orientation.vdb")
             return self._stop(wig, registration, orientation=field.lines())
         lone = wig.thresholds.strand
-        guides = self._guides(density, level, head, wig.knots, lone)
+        guides = self._guides(wig, density, head)
         if self.until == "guides":
             return self._stop(wig, registration, guides=guides.strands)
 
@@ -232,8 +232,10 @@ class _Job:
     def _orientation(self, density: BrickVolume, level: float, progress: Progress) -> OrientationField:
         return orientation_field(density, level, self.settings.orientation, progress=progress)
 
-    def _guides(self, density: BrickVolume, level: float, head: Head, knots: np.ndarray, lone: float) -> Guides:
-        """The guides; the orientation field, large and quickly made again, is computed and kept only until they are there."""
+    def _guides(self, wig: WigScan, density: BrickVolume, head: Head) -> Guides:
+        """The guides in `density`, the wig's without its net; the orientation field, large and quickly made again, is computed
+        and kept only until they are there."""
+        level, counted = wig.hair_level, len(wig.solid_points) > 0
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
             # in a list, to be handed over and held no longer: it is of the guides' peak of memory
@@ -241,7 +243,16 @@ class _Job:
         guides = self._stage(
             "guides",
             lambda progress: trace_guides(
-                density, level, fields.pop(), head, self.settings.guides, self.settings.run.seed, progress, knots, lone
+                density,
+                level,
+                fields.pop(),
+                head,
+                self.settings.guides,
+                self.settings.run.seed,
+                progress,
+                wig.knots,
+                wig.thresholds.strand,
+                counted=counted,
             ),
             guides,
         )

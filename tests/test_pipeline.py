@@ -135,6 +135,22 @@ def test_stopped_after_each_stage_it_shows_what_there_is_and_ends_as_if_it_had_n
         pipeline.reconstruct(scan, out, SETTINGS, until="end")
 
 
+@pytest.mark.parametrize("mannequin", ["shell", "none"])
+def test_knots_are_counted_where_there_is_a_mannequin(mannequin, tmp_path, monkeypatch):
+    head = template_head()
+    synthesize(hairstyle("bob", head, 1500, 11), head, tmp_path / "bob.vdb", 1.2, snr=4.0, seed=11, mannequin=mannequin)
+    told = []
+
+    def listen(*args, counted, **kwargs):
+        told.append(counted)
+        raise CT2HairError("heard enough")
+
+    monkeypatch.setattr(pipeline, "trace_guides", listen)
+    with pytest.raises(CT2HairError, match="heard enough"):
+        pipeline.reconstruct(tmp_path / "bob.vdb", tmp_path / "out", SETTINGS)
+    assert told == [mannequin != "none"]
+
+
 def test_a_scan_that_is_not_there_leaves_nothing(tmp_path):
     with pytest.raises(ScanError, match=r"absent\.vdb"):
         pipeline.reconstruct(tmp_path / "absent.vdb", tmp_path / "out", SETTINGS)

@@ -96,6 +96,7 @@ def trace_guides(
     progress: Progress = silent,
     knots: np.ndarray | None = None,
     peak: float = 0.0,
+    counted: bool = True,
 ) -> Guides:
     """Guide strands of the hair in `density` (air at 0, hair above `hair_level`) on `head`.
 
@@ -103,7 +104,8 @@ def trace_guides(
     over the scalp followed back through the hair to it or grown along rooted neighbours, each root led into the scalp, to a
     knot (`knots` (K, 3), mm) where there is one by it, no point left inside the head. With `settings.method` "paper" all of it
     goes the paper's way instead (`paper`). peak: density of a lone strand by the thresholds, which stands in where none runs
-    alone. The same seed gives the same strands, on any number of threads.
+    alone. counted: whether the knots are as many as the strands, as they are found by a mannequin's skin; without one they are
+    few and unsure. The same seed gives the same strands, on any number of threads.
     """
     settings = settings or GuideSettings()
     seeds = seed_voxels(field.confidence, field.direction, seed)
@@ -116,7 +118,7 @@ def trace_guides(
     del seeds, way
     floor = data_floor(density, hair_level, head)
     strands, more = root_segments(
-        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), density, profile.seen, knots, floor
+        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), density, profile.seen, knots, floor, counted
     )
     progress(1, 1)
     return Guides(strands, profile, tally | more)
@@ -132,11 +134,13 @@ def root_segments(
     strand: float = 0.0,
     knots: np.ndarray | None = None,
     floor: float = 0.0,
+    counted: bool = True,
 ) -> tuple[Strands, dict[str, int]]:
     """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; and what became of them.
 
     scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
-    knots: (K, 3) mm, where strands are tied to the net. floor: mm over the scalp below which the scan shows no hair.
+    knots: (K, 3) mm, where strands are tied to the net; counted: they are as many as the strands. floor: mm over the scalp
+    below which the scan shows no hair.
     """
     tally: dict[str, int] = {}
     knots = knots if settings.knots else None
@@ -149,7 +153,7 @@ def root_segments(
         fine = pieces.ends(fine)
         value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand))
         progress(0.3, 1.0)
-        known, merged = strands_by_knots(knots, head, spacing)
+        known, merged = strands_by_knots(knots if counted else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
             pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5), known, merged
         )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ct2hair_addon.evaluation import render_density
 from ct2hair_addon.guides import root_segments
 from ct2hair_addon.guides.direction import fine_ends, signs
 from ct2hair_addon.guides.growing import follow_to_scalp, grow_to_root
@@ -136,6 +137,17 @@ def test_rooted_strands_have_all_that_is_promised(ball):
     assert ball.signed_distance(guides.points[inner]).min() > 0
     assert guides.tips[:, 2].max() < guides.roots[:, 2].min() + 80
     assert (np.linalg.norm(guides.tips, axis=1) > np.linalg.norm(guides.roots, axis=1)).all()
+
+
+@pytest.mark.parametrize(("counted", "known", "price"), [(True, 60, 20), (False, 0, 30)])
+def test_knots_say_how_many_strands_there_are_only_where_all_of_them_are_found(ball, counted, known, price):
+    lines = [hair(a, 2, 40) for a in np.linspace(0, 6, 60)]
+    knots = np.array([hair(a, 0, 1)[0] for a in np.linspace(0, 6, 60)])
+    scan = render_density(Strands.from_polylines(lines), 1.0, 1.0)
+    made = Strands.from_polylines(lines)
+    guides, tally = root_segments(made, 1.0, ball, GuideSettings(), scan=scan, strand=1.0, knots=knots, counted=counted)
+    assert (tally["strands by the knots"], tally["dearest joint allowed"]) == (known, price)
+    assert tally["roots at knots of the net"] == len(guides) == 60
 
 
 def test_nothing_found_is_no_guides(ball):
