@@ -176,8 +176,8 @@ class RefinementSettings:
         high=64.0,
     )
     stiffness: float = parameter(
-        2.5,
-        "volume: shape is kept below about six times this length where hair bends, and twice as far where it is straight",
+        3.5,
+        "volume: waves shorter than about six times this length are noise of the tracing, but where hair bends as sharply",
         unit="voxel",
         low=0.0,
         high=100.0,

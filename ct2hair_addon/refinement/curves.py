@@ -10,29 +10,14 @@ from .splat import cubic
 
 TURN_PER_SEGMENT = 0.6
 """Radians that one cubic segment may turn: it then stays within 0.3 % of the radius of an arc."""
-SEGMENT_LENGTH = 3.0
-"""Longest segment of a straight strand, mm: hair bends within less than two of these where it leaves the scalp."""
+SEGMENT_LENGTH = 2.0
+"""Longest segment of a straight strand, mm: hair bends within less than three of these where it leaves the scalp."""
 LEAST_POINTS = 8
 TURN_PER_EDGE = 0.25
 """Radians that an output polyline turns at a point, where 16 to 128 points allow."""
 LONGEST_EDGE = 8.0
 """mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
-
-BEND_STEP = 8.0
-"""voxel; turning is measured over so much: shorter waves are noise of the tracing."""
-EASED_TURN = 0.1
-"""Radians that a strand turns over the length up to which it is eased: an arc then moves by a millionth of its radius."""
-EASED_LEAST, EASED_MOST = 4.0, 10.0
-"""voxel; the longest such length, and the shortest: hair that turns within less is a curl, and left as it was traced."""
-EASED_BY = 0.5
-"""voxel; easing moves a strand by no more than this, root mean square: as far as traces are off."""
-
-
-def mean_curvature(strands: Strands, voxel: float) -> np.ndarray:
-    """(N,) float64, 1/mm: how much each strand (mm) turns a length, waves of a few voxels left out. voxel: mm."""
-    even = strands.resampled_by_step(BEND_STEP * voxel)
-    return _turning(even.points, even.offsets) / np.maximum(strands.lengths(), 1e-6)
 
 
 def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -41,24 +26,6 @@ def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     lengths[:-1] = np.linalg.norm(np.diff(points, axis=0), axis=1)
     lengths[offsets[1:][np.diff(offsets) > 0] - 1] = 0.0
     return lengths
-
-
-def easing_lengths(curvature: np.ndarray, voxel: float) -> np.ndarray:
-    """(N,) float64, mm: below which waves of strands of `mean_curvature` (N,), 1/mm, are noise of tracing; 0 for curls. voxel:
-    mm."""
-    length = np.minimum(EASED_TURN / np.maximum(curvature, 1e-6), EASED_MOST * voxel)
-    return np.where(length < EASED_LEAST * voxel, 0.0, length)
-
-
-def eased(points: np.ndarray, offsets: np.ndarray, lengths: np.ndarray, voxel: float) -> np.ndarray:
-    """(M, 3) float64: evenly spaced points of strands, mm, without waves shorter than `lengths` (N,) mm: the least change of
-    bend along each strand (third differences) within `EASED_BY` of where it was; roots stay."""
-    counts = np.diff(offsets)
-    index = np.repeat(np.arange(len(counts)), counts)
-    steps = np.bincount(index, segment_lengths(points, offsets), len(counts)) / np.maximum(counts - 1, 1)
-    out = np.array(points, np.float64)
-    _ease(np.asarray(points, np.float64), offsets, lengths / np.maximum(steps, 1e-6), EASED_BY * voxel, out)
-    return out
 
 
 def control_points(strands: Strands, most: int, longest: float = SEGMENT_LENGTH) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +72,8 @@ def _edges_wanted(points, offsets):
         # Neighbours share, so that the spacing changes by degrees.
         total = 0.0
         for i in range(segments):
-            total += 0.25 * own[max(i - 1, 0)] + 0.5 * own[i] + 0.25 * own[min(i + 1, segments - 1)]
+            for k, share in enumerate((0.0625, 0.25, 0.375, 0.25, 0.0625)):
+                total += share * own[min(max(i + k - 2, 0), segments - 1)]
             wanted[start + i + 1] = total
     return wanted
 
@@ -188,62 +156,3 @@ def _turning(points, offsets):
         for m in range(offsets[n] + 1, offsets[n + 1] - 1):
             turning[n] += _turn(points, m)
     return turning
-
-
-ROOT_WEIGHT = 1e6
-BAND = 3
-
-
-@numba.njit(cache=True, parallel=True)
-def _ease(points, offsets, length, most, out):
-    """Per strand the x of least |x - p|^2 + length^6 |third differences of x|^2, with `length` (N,), in points, shortened
-    until the root mean square of x - p is at most `most`; into `out`, which holds p."""
-    for n in numba.prange(len(offsets) - 1):
-        start, size = offsets[n], offsets[n + 1] - offsets[n]
-        reach = length[n]
-        while size > 2 * BAND and reach > 0.1:
-            band = np.zeros((size, BAND + 1))
-            a = reach**6
-            for i in range(size - BAND):
-                for p in range(BAND + 1):
-                    for q in range(p, BAND + 1):
-                        band[i + p, q - p] += a * _third(p) * _third(q)
-            right = points[start : start + size].copy()
-            for i in range(size):
-                band[i, 0] += 1.0 if i else ROOT_WEIGHT
-            for axis in range(3):
-                right[0, axis] *= ROOT_WEIGHT
-            _solve_bands(band, right)
-            square = 0.0
-            for i in range(size):
-                for axis in range(3):
-                    square += (right[i, axis] - points[start + i, axis]) ** 2
-            if square <= most * most * size:
-                out[start + 1 : start + size] = right[1:]
-                break
-            reach *= 0.8
-
-
-@numba.njit(cache=True, inline="always")
-def _third(i):
-    """The weights of a third difference."""
-    return (-1.0, 3.0, -3.0, 1.0)[i]
-
-
-@numba.njit(cache=True)
-def _solve_bands(band, right):
-    """Solve a symmetric positive system in place (L D L'); band[i, k] couples i and i + k."""
-    size, width = band.shape
-    for i in range(size):
-        for k in range(1, min(width, size - i)):
-            f = band[i, k] / band[i, 0]
-            for q in range(k, min(width, size - i)):
-                band[i + k, q - k] -= f * band[i, q]
-            for axis in range(3):
-                right[i + k, axis] -= f * right[i, axis]
-    for i in range(size - 1, -1, -1):
-        for axis in range(3):
-            value = right[i, axis]
-            for k in range(1, min(width, size - i)):
-                value -= band[i, k] * right[i + k, axis]
-            right[i, axis] = value / band[i, 0]

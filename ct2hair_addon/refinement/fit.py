@@ -1,7 +1,7 @@
 """The default refinement: all strands at once against the volume, coarse to fine (in place of the paper's 3.3.2 Chamfer).
 
 Strands are rendered through the scanner's blur, the misfit to the scan is blurred back into a potential, and every strand
-moves down its slope as a stiff curve with a pinned root, kept lengths and no point inside the head.
+moves down its slope as a smooth curve with a pinned root and no point inside the head.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import numpy as np
 
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
-from ..strands import Strands
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .boundary import Boundary
-from .curves import eased, easing_lengths, local_curvature, mean_curvature, segment_lengths
+from .curves import local_curvature, segment_lengths
 from .device import takes_card
-from .motion import gather_forces, keep_lengths, stiff_step
+from .motion import gather_forces, keep_lengths, smooth_step
 from .splat import blurred, halved, misfit
 
 LEVEL_BLUR = 0.85
@@ -32,10 +31,14 @@ FRICTION = 0.5
 STEP_LIMIT = 0.5
 """Longest move in one iteration, voxels: within the reach of the potential that it follows."""
 LENGTH_SWEEPS = 6
-STIFF_TURN = 0.075
-"""Radians that a strand turns over the length that its shape is kept below."""
-SMOOTH_HAIR = 2.0
-"""How much longer than `stiffness` that length may be where hair bends little: short waves are noise and hops there."""
+SMOOTH_TURN = 0.15
+"""Radians that a strand turns over the length that it is smoothed by at most: its curls then lose nothing that counts."""
+LEAST_SMOOTH = 1.5
+"""voxel; the least such length."""
+FIRST_SMOOTH, SETTLED = 3.0, 0.7
+"""How many times `stiffness` it is at first, to pull hops straight, and the share of iterations after which it is that."""
+BENDS_EVERY = 4
+"""Iterations after which bends are measured anew."""
 PLANES_EVERY = 10
 """Iterations after which the head's tangent planes are taken anew; a point moves a few voxels at most in between."""
 
@@ -78,15 +81,16 @@ def fit_to_volume(
     settings: RefinementSettings,
     device: str = "auto",
     progress: Progress = silent,
+    traced: np.ndarray | None = None,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally.
 
-    device: 'auto' takes a graphics card for what is done to voxels where torch has one, 'cpu' none.
+    traced: (N,) bool, strands that were found in the scan, whose short waves are noise (None: none was); others keep theirs,
+    and their lengths. device: 'auto' takes a graphics card for what is done to voxels where torch has one, 'cpu' none.
     """
     points = np.array(points, np.float64)
-    curvature = mean_curvature(Strands(points.astype(np.float32), offsets), density.spacing)
-    bends = STIFF_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
-    noise = easing_lengths(curvature, density.spacing)
+    made_up = np.ones(len(offsets) - 1, bool) if traced is None else ~np.asarray(traced, bool)
+    shaped = np.repeat(made_up, np.diff(offsets))
     rest_lengths = segment_lengths(points, offsets)
     levels = pyramid(density, profile.blur, settings.coarsest)
     plan = shares(settings.iterations, len(levels))
@@ -98,28 +102,28 @@ def fit_to_volume(
     for number, (level, count) in enumerate(zip(levels, plan, strict=True)):
         stage = part(progress, done[number], done[number + 1])
         size = level.scan.spacing
-        stiffness = np.clip(bends, settings.stiffness * size, SMOOTH_HAIR * settings.stiffness * size)
         gain = profile.line_mass / size**2
         newton = 8.0 * np.pi * level.blur**4 / gain
         potential = potential_of(level.scan, level.blur, gain)
         forces, weights = np.empty_like(points), np.empty(len(points))
         velocity = np.zeros_like(points)
-        rest = points.copy()
+        rest = points * shaped[:, None]
         for iteration in range(count):
             step = part(stage, iteration / count, (iteration + 1) / count)
-            if level is levels[-1] and iteration == count // 2:
-                points = eased(points, offsets, noise, size)
-                rest, velocity, rest_lengths = points.copy(), np.zeros_like(points), segment_lengths(points, offsets)
             if iteration % PLANES_EVERY == 0:
                 visible = boundary.look(points)
             voxels = level.scan.to_voxel(points)
             error = potential.update(voxels, offsets, visible, part(step, 0.0, 0.9))
             potential.forces(voxels, offsets, visible, forces, weights)
             forces *= newton * size
-            stiff_step(
-                points, rest, offsets, forces, weights, stiffness, RELAXATION, FRICTION, STEP_LIMIT * size, velocity
+            if iteration % BENDS_EVERY == 0:
+                bends = SMOOTH_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
+            most = settings.stiffness * size * FIRST_SMOOTH ** max(1.0 - iteration / (SETTLED * count), 0.0)
+            smooth = np.where(shaped, settings.stiffness * size, np.clip(bends, LEAST_SMOOTH * size, most))
+            smooth_step(
+                points, rest, offsets, forces, weights, smooth, RELAXATION, FRICTION, STEP_LIMIT * size, velocity
             )  # fmt: skip
-            keep_lengths(points, offsets, rest_lengths, LENGTH_SWEEPS)
+            keep_lengths(points, offsets, made_up, rest_lengths, LENGTH_SWEEPS)
             boundary.push(points, offsets)
             if iteration == 0:
                 tally[f"misfit before, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))

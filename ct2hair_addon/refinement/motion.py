@@ -1,8 +1,9 @@
 """How strands give way to a misfit: forces gathered along them, stiff steps, kept lengths, nothing inside the head (3.3.2).
 
 The force is a Newton step: the gradient of the misfit over the curvature that a lone strand's misfit has. A step is the
-solution of a small elastic problem per strand (data against the bending of the displacement, the role of eqs. 4 and 5):
-long waves follow the data, short ones keep the shape that the strand had, so curls stay and hops between neighbours don't grow.
+solution of a small elastic problem per strand (data against the change of bend, the role of eqs. 4 and 5). Long waves
+follow the data. Short ones stay where a strand was made up; where it was traced they are noise and hops between neighbours,
+and go.
 """
 
 from __future__ import annotations
@@ -89,13 +90,19 @@ def _gradient(table, bricks, x, y, z):
     return gx, gy, gz
 
 
-@numba.njit(cache=True, parallel=True)
-def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction, limit, velocity):
-    """One step of every strand towards the minimum of data + bending of the displacement from `rest`; roots stay.
+BAND = 3
+HIDDEN_WEIGHT = 1e-2
+"""What holds points that the scan can't show where they are: they go with their neighbours, but by and by."""
 
-    Solves, per strand and axis, (w + a K) d = rate * w * force - a K (points - rest), K = D2' D2 (second differences),
-    a = (stiffness / segment length)^4 at each point; then velocity = friction * velocity + d, cut to `limit`, moves the points.
-    stiffness (M,), limit and lengths in the unit of `points`.
+
+@numba.njit(cache=True, parallel=True)
+def smooth_step(points, rest, offsets, forces, weights, smooth, rate, friction, limit, velocity):
+    """One step of every strand towards the least of data + change of bend along (points - rest); roots stay.
+
+    Solves, per strand and axis, (w + a K) d = rate * w * force - a K (points - rest), K = D3' D3 (third differences),
+    a = (smooth / segment length)^6 at each point; then velocity = friction * velocity + d, cut to `limit`, moves the points.
+    rest (M, 3): the shape that is kept, or zeros where a strand has none to keep and is to be smooth itself. smooth (M,), limit
+    and lengths in the unit of `points`. Strands of fewer than 4 points are moved without stiffness.
     """
     for n in numba.prange(len(offsets) - 1):
         start, size = offsets[n], offsets[n + 1] - offsets[n]
@@ -104,38 +111,35 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
         length = 0.0
         for m in range(start, start + size - 1):
             length += np.sqrt(
-                (rest[m + 1, 0] - rest[m, 0]) ** 2 + (rest[m + 1, 1] - rest[m, 1]) ** 2 + (rest[m + 1, 2] - rest[m, 2]) ** 2
+                (points[m + 1, 0] - points[m, 0]) ** 2
+                + (points[m + 1, 1] - points[m, 1]) ** 2
+                + (points[m + 1, 2] - points[m, 2]) ** 2
             )
         step = max(length / (size - 1), 1e-6)
-        diagonal, one, two = np.zeros(size), np.zeros(size), np.zeros(size)
+        band = np.zeros((size, BAND + 1))
         right = np.zeros((size, 3))
         for i in range(size):
             w = weights[start + i]
-            diagonal[i] = w + 1e-3
+            band[i, 0] = w + HIDDEN_WEIGHT
             for axis in range(3):
                 right[i, axis] = rate * w * forces[start + i, axis]
-        for i in range(1, size - 1):
+        for i in range(size - BAND):
             # A band at most so stiff that float64 still resolves the data beside it.
-            a = min((stiffness[start + i] / step) ** 4, 1e8)
-            diagonal[i - 1] += a
-            diagonal[i] += 4.0 * a
-            diagonal[i + 1] += a
-            one[i - 1] -= 2.0 * a
-            one[i] -= 2.0 * a
-            two[i - 1] += a
+            a = min((0.5 * (smooth[start + i + 1] + smooth[start + i + 2]) / step) ** 6, 1e8)
+            for p in range(BAND + 1):
+                for q in range(p, BAND + 1):
+                    band[i + p, q - p] += a * _third(p) * _third(q)
             for axis in range(3):
-                bend = 0.0
-                bend += points[start + i - 1, axis] - rest[start + i - 1, axis]
-                bend -= 2.0 * (points[start + i, axis] - rest[start + i, axis])
-                bend += points[start + i + 1, axis] - rest[start + i + 1, axis]
-                right[i - 1, axis] -= a * bend
-                right[i, axis] += 2.0 * a * bend
-                right[i + 1, axis] -= a * bend
+                change = 0.0
+                for p in range(BAND + 1):
+                    change += _third(p) * (points[start + i + p, axis] - rest[start + i + p, axis])
+                for p in range(BAND + 1):
+                    right[i + p, axis] -= a * _third(p) * change
         # The root: a row of its own.
-        diagonal[0], one[0], two[0] = 1.0, 0.0, 0.0
-        for axis in range(3):
-            right[0, axis] = 0.0
-        _solve_band(diagonal, one, two, right)
+        band[0, :] = 0.0
+        band[0, 0] = 1.0
+        right[0, :] = 0.0
+        _solve_bands(band, right)
         for i in range(1, size):
             m = start + i
             speed = 0.0
@@ -149,36 +153,38 @@ def stiff_step(points, rest, offsets, forces, weights, stiffness, rate, friction
                 points[m, axis] += velocity[m, axis]
 
 
+@numba.njit(cache=True, inline="always")
+def _third(i):
+    """The weights of a third difference."""
+    return (-1.0, 3.0, -3.0, 1.0)[i]
+
+
 @numba.njit(cache=True)
-def _solve_band(diagonal, one, two, right):
-    """Solve a symmetric pentadiagonal system in place (L D L'); one[i] couples i and i + 1, two[i] couples i and i + 2."""
-    size = len(diagonal)
+def _solve_bands(band, right):
+    """Solve a symmetric positive system in place (L D L'); band[i, k] couples i and i + k."""
+    size, width = band.shape
     for i in range(size):
-        if i + 1 < size:
-            f = one[i] / diagonal[i]
-            diagonal[i + 1] -= f * one[i]
-            if i + 2 < size:
-                one[i + 1] -= f * two[i]
-                g = two[i] / diagonal[i]
-                diagonal[i + 2] -= g * two[i]
-                for axis in range(3):
-                    right[i + 2, axis] -= g * right[i, axis]
+        for k in range(1, min(width, size - i)):
+            f = band[i, k] / band[i, 0]
+            for q in range(k, min(width, size - i)):
+                band[i + k, q - k] -= f * band[i, q]
             for axis in range(3):
-                right[i + 1, axis] -= f * right[i, axis]
+                right[i + k, axis] -= f * right[i, axis]
     for i in range(size - 1, -1, -1):
         for axis in range(3):
             value = right[i, axis]
-            if i + 1 < size:
-                value -= one[i] * right[i + 1, axis]
-            if i + 2 < size:
-                value -= two[i] * right[i + 2, axis]
-            right[i, axis] = value / diagonal[i]
+            for k in range(1, min(width, size - i)):
+                value -= band[i, k] * right[i + k, axis]
+            right[i, axis] = value / band[i, 0]
 
 
 @numba.njit(cache=True, parallel=True)
-def keep_lengths(points, offsets, lengths, sweeps):
-    """Pull neighbouring points back to their segment's length (M,) (that of point m to m + 1), the root held."""
+def keep_lengths(points, offsets, held, lengths, sweeps):
+    """Pull neighbouring points of strands that are `held` (N,) bool back to their segment's length (M,) (that of point m to
+    m + 1), the root held."""
     for n in numba.prange(len(offsets) - 1):
+        if not held[n]:
+            continue
         start, end = offsets[n], offsets[n + 1]
         for _ in range(sweeps):
             for m in range(start, end - 1):

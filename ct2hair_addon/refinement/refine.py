@@ -52,7 +52,7 @@ def refine(
     device: str = "auto",
     peak: float = 0.0,
 ) -> Refined:
-    """Fit strands to the scan that they came from: roots stay where they are, lengths and curls are kept.
+    """Fit strands to the scan that they came from: roots stay where they are, curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
@@ -82,7 +82,8 @@ def refine(
         tally |= {f"{name}, before fitting": count for name, count in counts.items()}
     if settings.iterations and len(kept):
         step = part(progress, 0.15, 0.85)
-        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, step)
+        traced = kept.strand_attributes.get("guide")
+        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, step, traced)
         tally |= counts
         if judged:
             points, offsets, kept, counts = _pruned(
@@ -120,13 +121,13 @@ def _pruned(points, offsets, strands, density, profile, boundary, progress, reac
     return points, offsets_from_counts(stay[alive]), strands.select(alive), tally
 
 
-def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, progress):
+def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, progress, traced):
     """The control points after the chosen method, and its tally."""
     if settings.method == "chamfer":
         from .chamfer import fit_to_points  # torch takes seconds to import: only who asks for it pays
 
         return fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, device, progress)
-    return fit_to_volume(points, offsets, density, profile, boundary, settings, device, progress)
+    return fit_to_volume(points, offsets, density, profile, boundary, settings, device, progress, traced)
 
 
 def _supported(strands: Strands, density: BrickVolume, hair_level: float) -> Strands:
