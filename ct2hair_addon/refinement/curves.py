@@ -18,6 +18,8 @@ TURN_PER_EDGE = 0.25
 LONGEST_EDGE = 8.0
 """mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
+SHARES = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
+"""Of what its neighbours want each segment gets so much: edges then grow by degrees."""
 
 
 def segment_lengths(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -69,11 +71,10 @@ def _edges_wanted(points, offsets):
             turn = _turn(points, m) / TURN_PER_EDGE
             own[m - start - 1] += 0.5 * turn
             own[m - start] += 0.5 * turn
-        # Neighbours share, so that the spacing changes by degrees.
         total = 0.0
         for i in range(segments):
-            for k, share in enumerate((0.0625, 0.25, 0.375, 0.25, 0.0625)):
-                total += share * own[min(max(i + k - 2, 0), segments - 1)]
+            for k, share in enumerate(SHARES):
+                total += share * own[min(max(i + k - len(SHARES) // 2, 0), segments - 1)]
             wanted[start + i + 1] = total
     return wanted
 

@@ -151,7 +151,7 @@ def test_points_lie_closer_where_hair_bends():
     assert fine_offsets[1] == 16
     edges = np.linalg.norm(np.diff(fine, axis=0), axis=1)
     assert edges[:4].max() < 0.35 * edges[-4:].max()
-    assert (edges[1:] / edges[:-1]).max() < 2.7
+    assert (edges[1:] / edges[:-1]).max() < 2.5
     curve, _ = _evaluated(points, offsets, 2000)
     closest = cKDTree(Strands.from_polylines([fine]).resampled(4000)[0]).query(curve)[0]
     evenly, _ = _evaluated(points, offsets, 16)
