@@ -22,17 +22,17 @@ from . import __version__
 from .checkpoints import Checkpoints, chained_key, fingerprint
 from .errors import CT2HairError
 from .evaluation import write_report
-from .guides import Guides, trace_guides
+from .guides import Guides, amend_guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
-from .refinement import Refined, check_device, refine
+from .refinement import Refined, check_device, refine, without_surplus
 from .settings import STOPS, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
-from .volume.strand_signal import StrandProfile
+from .volume.strand_signal import StrandProfile, lone_profile
 
 STAGES = ("scan", "head", "orientation", "guides", "dense", "refinement", "result")
 SHARES = dict(zip(STAGES, (0.15, 0.08, 0.08, 0.35, 0.08, 0.22, 0.04), strict=True))
@@ -46,6 +46,9 @@ TEXTS = {
     "refinement": "fitting strands to the scan",
     "result": "writing the result",
 }
+TRACED, TRACING = "traced", 0.5
+"""The checkpoint within the guides' stage, and the share of the stage that lies before it."""
+
 _TYPES = (
     BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds, WigScan,
 )  # fmt: skip
@@ -235,28 +238,13 @@ class _Job:
     def _guides(self, wig: WigScan, density: BrickVolume, head: Head) -> Guides:
         """The guides in `density`, the wig's without its net; the orientation field, large and quickly made again, is computed
         and kept only until they are there."""
-        level, counted = wig.hair_level, len(wig.solid_points) > 0
         guides = self.checkpoints.load("guides", self.keys["guides"])
         if guides is None:
             # in a list, to be handed over and held no longer: it is of the guides' peak of memory
-            fields = [self._stage("orientation", lambda progress: self._orientation(density, level, progress))]
-        guides = self._stage(
-            "guides",
-            lambda progress: trace_guides(
-                density,
-                level,
-                fields.pop(),
-                head,
-                self.settings.guides,
-                self.settings.run.seed,
-                progress,
-                wig.knots,
-                wig.thresholds.strand,
-                counted=counted,
-            ),
-            guides,
-        )
+            fields = [self._stage("orientation", lambda progress: self._orientation(density, wig.hair_level, progress))]
+        guides = self._stage("guides", lambda progress: self._guides_amended(wig, density, head, fields, progress), guides)
         self.checkpoints.drop("orientation")
+        self.checkpoints.drop(TRACED)
         if not len(guides.strands):
             dropped = "; ".join(f"{reason}: {count}" for reason, count in guides.tally.items())
             raise CT2HairError(
@@ -264,6 +252,47 @@ class _Job:
                 "or lower orientation.confidence"
             )
         return guides
+
+    def _guides_amended(self, wig, density, head, fields, progress: Progress) -> Guides:
+        """Traced guides, amended as often as the settings want it; the traced ones are kept until these are there."""
+        settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
+        counted = len(wig.solid_points) > 0
+        method = settings.guides.method == "trace" and settings.refinement.method == "volume"
+        rounds = settings.guides.amend if method else 0
+        share = TRACING if rounds else 1.0
+        guides = self.checkpoints.load(TRACED, self.keys["guides"])
+        if guides is None:
+            guides = trace_guides(
+                density, level, fields.pop(), head, settings.guides, seed, part(progress, 0.0, share), wig.knots, lone, counted
+            )
+            if rounds:
+                self.checkpoints.save(TRACED, self.keys["guides"], guides)
+        fields.clear()
+        for number in range(rounds if len(guides.strands) else 0):
+            step = part(progress, *(share + (1.0 - share) * np.array([number, number + 1]) / rounds))
+            guides = self._amended(guides, number + 1, wig, density, head, step, counted)
+        return guides
+
+    def _amended(self, guides: Guides, number: int, wig, density, head, progress: Progress, counted: bool) -> Guides:
+        """The guides fitted to the scan, what they have too many cut out, and what they lack traced anew."""
+        settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
+        traced = guides.strands.with_attributes(guide=np.ones(len(guides.strands), bool))
+        profile = lone_profile(density, level, traced, lone, part(progress, 0.0, 0.05))
+        device, step = settings.run.device, part(progress, 0.05, 0.6)
+        fitted = refine(traced, density, level, head, settings.refinement, seed, step, profile, device, lone)
+        if not len(fitted.strands):
+            return guides
+        pieces, rest, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
+        # in a list, to be handed over and held no longer
+        fields = [self.checkpoints.load("orientation", self.keys["orientation"])]
+        if fields[0] is None:
+            fields = [self._orientation(density, level, part(progress, 0.65, 0.75))]
+        step, wanted = part(progress, 0.75, 1.0), settings.guides
+        amended = amend_guides(
+            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted
+        )
+        tally = {f"amended {number}: {name}": count for name, count in (fitted.tally | cut | amended.tally).items()}
+        return Guides(amended.strands, guides.profile, guides.tally | tally)
 
     def _write(
         self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined, tallies
@@ -331,6 +360,7 @@ class _Job:
         depends["head"] = {"template": _digest(self.template.vertices, self.template.faces, self.template.scalp)}
         for stage in ("guides", "dense", "refinement"):
             depends[stage] = {"seed": self.settings.run.seed}
+        depends["guides"]["fit"] = dataclasses.asdict(self.settings.refinement)
         settings_of = {"dense": "interpolation"}
         keys, previous = {}, chained_key("", version=__version__)
         for stage, values in depends.items():

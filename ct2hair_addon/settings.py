@@ -99,6 +99,12 @@ class GuideSettings:
     min_support: float = parameter(
         0.15, "a strand of which less than this share was traced in the scan is dropped", low=0.0, high=1.0
     )
+    amend: int = parameter(
+        1,
+        "how often guides are fitted to the scan, what they have too many is cut out and what they lack traced anew",
+        low=0,
+        high=8,
+    )
     neighbour_radius: float = parameter(
         3.0, "reach of a poor segment for a fine neighbour (tau_s)", unit="mm", low=0.1, high=50.0
     )
@@ -163,10 +169,13 @@ class RefinementSettings:
         "volume: all strands against the density itself; chamfer: the paper's, points of strands against points of the scan",
         choices=("volume", "chamfer"),
     )
-    iterations: int = parameter(40, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
+    iterations: int = parameter(50, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
     points: int = parameter(128, "control points of each strand at most", low=8, high=256)
     prune: bool = parameter(
         True, "volume: made-up strands and tips that explain nothing of the scan go, and traced strands that only double others"
+    )
+    exchange: bool = parameter(
+        True, "volume: traced strands that went over to each other's course, where they touch, exchange their tips"
     )
     coarsest: float = parameter(
         1.0,
@@ -334,7 +343,7 @@ _PARAMETERS = dict(parameters())
 _TYPES = {"float": float, "int": int, "str": str, "bool": bool}
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"refinement.iterations": 15, "refinement.points": 64},
+    "draft": {"guides.amend": 0, "refinement.iterations": 15, "refinement.points": 64},
     "standard": {},
     "final": {"refinement.iterations": 120, "refinement.points": 192},
     "paper": {

@@ -10,7 +10,7 @@ import numpy as np
 from ..head import Head
 from ..progress import Progress, part, silent
 from ..settings import GuideSettings
-from ..strands import Strands
+from ..strands import Strands, concatenate
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor
 from .direction import fine_ends, signs
@@ -122,6 +122,39 @@ def trace_guides(
     )
     progress(1, 1)
     return Guides(strands, profile, tally | more)
+
+
+def amend_guides(
+    pieces: Strands,
+    rest: BrickVolume,
+    density: BrickVolume,
+    hair_level: float,
+    field: HairField,
+    head: Head,
+    profile: StrandProfile,
+    settings: GuideSettings | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    knots: np.ndarray | None = None,
+    counted: bool = True,
+) -> Guides:
+    """Guide strands from `pieces` of fitted ones (mm) and what is traced in the `rest` of the scan, which is used up: both are
+    joined and rooted as in `trace_guides`, where the other arguments are explained."""
+    settings = settings or GuideSettings()
+    seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
+    del field
+    order = seed_order(rest, *seeds, profile, part(progress, 0.0, 0.2))
+    found = trace_segments(rest, way, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.2, 0.5))
+    del seeds, way
+    traced = Strands(density.to_scan(found.points), found.offsets)
+    segments = concatenate([pieces.resampled_by_step(density.spacing), traced])
+    floor = data_floor(density, hair_level, head)
+    step = part(progress, 0.5, 1.0)
+    strands, tally = root_segments(
+        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted
+    )
+    progress(1, 1)
+    return Guides(strands, profile, {"pieces": len(pieces), "traced beside them": len(traced)} | tally)
 
 
 def root_segments(

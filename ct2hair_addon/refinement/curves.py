@@ -52,6 +52,18 @@ def polylines(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.n
     return out, out_offsets
 
 
+def even_lines(points: np.ndarray, offsets: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 3) float64 points on the cubics, about `step` apart (mm), and (N + 1,) offsets."""
+    along = np.zeros(len(points))
+    along[1:] = np.cumsum(segment_lengths(points, offsets)[:-1])
+    along -= np.repeat(along[offsets[:-1]], np.diff(offsets))
+    counts = np.maximum(np.ceil(along[offsets[1:] - 1] / step).astype(np.int64), 1) + 1
+    out_offsets = offsets_from_counts(counts)
+    out = np.empty((out_offsets[-1], 3))
+    _evaluate_cubics(points, offsets, along, out_offsets, out)
+    return out, out_offsets
+
+
 @numba.njit(cache=True, parallel=True)
 def _edges_wanted(points, offsets):
     """(M,) float64: how many edges a strand wants from its root to each control point, by length and by turning."""

@@ -36,7 +36,7 @@ SMOOTH_TURN = 0.15
 LEAST_SMOOTH = 1.5
 """voxel; the least such length."""
 FIRST_SMOOTH, SETTLED = 3.0, 0.7
-"""How many times `stiffness` it is at first, to pull hops straight, and the share of iterations after which it is that."""
+"""How many times `stiffness` it is at first, and the share of iterations after which it is that."""
 BENDS_EVERY = 4
 """Iterations after which bends are measured anew."""
 PLANES_EVERY = 10
@@ -82,11 +82,13 @@ def fit_to_volume(
     device: str = "auto",
     progress: Progress = silent,
     traced: np.ndarray | None = None,
+    first: float = FIRST_SMOOTH,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Move control points (M, 3) float64 mm, strands by `offsets`, to fit the scan. Returns new points and a tally.
 
     traced: (N,) bool, strands that were found in the scan, whose short waves are noise (None: none was); others keep theirs,
-    and their lengths. device: 'auto' takes a graphics card for what is done to voxels where torch has one, 'cpu' none.
+    and their lengths. device: 'auto' takes a graphics card for what is done to voxels where torch has one, 'cpu' none. first:
+    how many times `stiffness` it is at first, to pull hops straight.
     """
     points = np.array(points, np.float64)
     made_up = np.ones(len(offsets) - 1, bool) if traced is None else ~np.asarray(traced, bool)
@@ -118,7 +120,7 @@ def fit_to_volume(
             forces *= newton * size
             if iteration % BENDS_EVERY == 0:
                 bends = SMOOTH_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
-            most = settings.stiffness * size * FIRST_SMOOTH ** max(1.0 - iteration / (SETTLED * count), 0.0)
+            most = settings.stiffness * size * first ** max(1.0 - iteration / (SETTLED * count), 0.0)
             smooth = np.where(shaped, settings.stiffness * size, np.clip(bends, LEAST_SMOOTH * size, most))
             smooth_step(
                 points, rest, offsets, forces, weights, smooth, RELAXATION, FRICTION, STEP_LIMIT * size, velocity

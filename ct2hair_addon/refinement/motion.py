@@ -139,7 +139,7 @@ def smooth_step(points, rest, offsets, forces, weights, smooth, rate, friction, 
         band[0, :] = 0.0
         band[0, 0] = 1.0
         right[0, :] = 0.0
-        _solve_bands(band, right)
+        solve_bands(band, right)
         for i in range(1, size):
             m = start + i
             speed = 0.0
@@ -160,18 +160,19 @@ def _third(i):
 
 
 @numba.njit(cache=True)
-def _solve_bands(band, right):
-    """Solve a symmetric positive system in place (L D L'); band[i, k] couples i and i + k."""
+def solve_bands(band, right):
+    """Solve a symmetric positive system in place (L D L'); band[i, k] couples i and i + k; right (n, axes)."""
     size, width = band.shape
+    axes = right.shape[1]
     for i in range(size):
         for k in range(1, min(width, size - i)):
             f = band[i, k] / band[i, 0]
             for q in range(k, min(width, size - i)):
                 band[i + k, q - k] -= f * band[i, q]
-            for axis in range(3):
+            for axis in range(axes):
                 right[i + k, axis] -= f * right[i, axis]
     for i in range(size - 1, -1, -1):
-        for axis in range(3):
+        for axis in range(axes):
             value = right[i, axis]
             for k in range(1, min(width, size - i)):
                 value -= band[i, k] * right[i + k, axis]

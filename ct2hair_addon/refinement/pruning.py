@@ -9,6 +9,8 @@ double: such a strand stays whole unless it doubles others all along.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -57,21 +59,10 @@ def prune(
     if not len(counts):
         return kept, {REMOVED: 0, CUT_BACK: 0}
     voxels = density.to_voxel(points)
-    gain = profile.line_mass / density.spacing**2
-    excess = render(voxels, offsets, visible, density, profile.blur, part(progress, 0.0, 0.7))
-    for start in range(0, len(excess), CHUNK):
-        excess[start : start + CHUNK] *= np.float32(gain)
-        excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
-    if reach:
-        excess = blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach)
-    blur = float(np.hypot(profile.blur, reach))
-    peak = gain / (2.0 * np.pi * blur**2)
-    # what trilinear reads see of a strand's profile on its line and on the ring
-    wide = blur**2 + INTERPOLATION_VARIANCE
-    seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
+    excess, mark = excess_of(voxels, offsets, visible, density, profile, reach, part(progress, 0.0, 0.7))
     earned = np.empty(len(counts))
-    bare = 0.0 if reach else BARE * peak
-    _earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, peak, seen, earned)
+    bare = 0.0 if reach else BARE * mark.peak
+    earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, mark.peak, mark.seen, earned)
     progress(0.8, 1.0)
     order = np.argsort(earned, kind="stable")
     traced = np.zeros(len(counts), bool) if traced is None else np.asarray(traced, bool)
@@ -79,8 +70,8 @@ def prune(
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
         _cut(
-            density.table, excess, density.bricks, bare, voxels, offsets, visible, order[start : start + step], peak, seen,
-            blur, traced, kept,
+            density.table, excess, density.bricks, bare, voxels, offsets, visible, order[start : start + step], mark.peak,
+            mark.seen, mark.blur, traced, kept,
         )  # fmt: skip
     progress(1.0, 1.0)
     gone = int(np.count_nonzero((kept == 0) & (counts > 0)))
@@ -89,6 +80,41 @@ def prune(
         CUT_BACK: int(np.count_nonzero((kept > 0) & (kept < counts))),
     }
     return kept, tally
+
+
+class Mark(NamedTuple):
+    """What one strand too many leaves in the misfit: its peak, its blur (voxels), and what trilinear reads see of the peak on
+    its line and on the ring around it."""
+
+    peak: float
+    blur: float
+    seen: np.ndarray
+
+
+def excess_of(
+    voxels: np.ndarray,
+    offsets: np.ndarray,
+    visible: np.ndarray,
+    density: BrickVolume,
+    profile: StrandProfile,
+    reach: float = 0.0,
+    progress: Progress = silent,
+) -> tuple[np.ndarray, Mark]:
+    """((B, 16, 16, 16) float32: the strands as rendered less the scan, blurred by `reach` voxels; a strand's mark there).
+
+    voxels (M, 3): their points; the rest as for `prune`.
+    """
+    gain = profile.line_mass / density.spacing**2
+    excess = render(voxels, offsets, visible, density, profile.blur, progress)
+    for start in range(0, len(excess), CHUNK):
+        excess[start : start + CHUNK] *= np.float32(gain)
+        excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
+    if reach:
+        excess = blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach)
+    blur = float(np.hypot(profile.blur, reach))
+    wide = blur**2 + INTERPOLATION_VARIANCE
+    seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide
+    return excess, Mark(gain / (2.0 * np.pi * blur**2), blur, seen)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -113,7 +139,7 @@ def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
 
 
 @numba.njit(cache=True, nogil=True)
-def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned):
+def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned):
     """Fill `earned` (end - start,) with what the strand earns up to each of its control points; its visible length, voxels."""
     total, whole = 0.0, 0.0
     earned[0] = 0.0
@@ -148,13 +174,14 @@ def _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, 
 
 
 @numba.njit(cache=True, parallel=True)
-def _earn(table, excess, scan, bare, points, offsets, visible, peak, seen, out):
+def earn(table, excess, scan, bare, points, offsets, visible, peak, seen, out):
+    """Fill `out` (N,) with what each strand earns as a whole (`prefix`)."""
     for n in numba.prange(len(out)):
         size = offsets[n + 1] - offsets[n]
         out[n] = 0.0
         if size > 1:
             earned = np.empty(size)
-            _prefix(table, excess, scan, bare, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
+            prefix(table, excess, scan, bare, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
             out[n] = earned[size - 1]
 
 
@@ -166,7 +193,7 @@ def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen,
         if size < 2:
             continue
         earned = np.empty(size)
-        shown = _prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned)
+        shown = prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, earned)
         best = 0
         for m in range(size):
             if earned[m] > earned[best]:
@@ -182,29 +209,32 @@ def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen,
         else:
             continue
         kept[n] = stay
-        # what is cut no longer shows: take its profile out of the rendering
-        low = start + max(stay - 1, 0)
-        samples = 0
-        for m in range(low, end - 1):
-            samples += segment_samples(points, m)
-        path = np.empty((samples + 1, 3), np.float32)
-        amplitude = np.empty(samples + 1)
-        for axis in range(3):
-            path[0, axis] = points[low, axis]
-        amplitude[0] = -peak * visible[low]
-        at = 1
-        for m in range(low, end - 1):
-            first, last = m == start, m + 2 >= end
-            p0 = m if first else m - 1
-            p3 = m + 1 if last else m + 2
-            count = segment_samples(points, m)
-            for s in range(count):
-                wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
-                for axis in range(3):
-                    path[at, axis] = (
-                        wa * points[p0, axis] + wb * points[m, axis] + wc * points[m + 1, axis] + wd * points[p3, axis]
-                    )
-                t = (s + 1.0) / count
-                amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
-                at += 1
-        add_strand(table, excess, path, amplitude, blur)
+        take_out(table, excess, points, visible, start, end, start + max(stay - 1, 0), end - 1, peak, blur)
+
+
+@numba.njit(cache=True, nogil=True)
+def take_out(table, excess, points, visible, start, end, low, high, peak, blur):
+    """Take the profile of a strand (control points `start` to `end`) between its control points `low` and `high` out of the
+    rendering: what is cut no longer shows."""
+    samples = 0
+    for m in range(low, high):
+        samples += segment_samples(points, m)
+    path = np.empty((samples + 1, 3), np.float32)
+    amplitude = np.empty(samples + 1)
+    for axis in range(3):
+        path[0, axis] = points[low, axis]
+    amplitude[0] = -peak * visible[low]
+    at = 1
+    for m in range(low, high):
+        first, last = m == start, m + 2 >= end
+        p0 = m if first else m - 1
+        p3 = m + 1 if last else m + 2
+        count = segment_samples(points, m)
+        for s in range(count):
+            wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
+            for axis in range(3):
+                path[at, axis] = wa * points[p0, axis] + wb * points[m, axis] + wc * points[m + 1, axis] + wd * points[p3, axis]
+            t = (s + 1.0) / count
+            amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
+            at += 1
+    add_strand(table, excess, path, amplitude, blur)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, supp
 from .agreement import agreements
 from .boundary import Boundary
 from .curves import SEGMENT_LENGTH, control_points, polylines
-from .fit import fit_to_volume
+from .exchange import exchange_tips
+from .fit import FIRST_SMOOTH, fit_to_volume
 from .pruning import prune
 
 MISPLACED = 2.0
@@ -24,6 +25,14 @@ CHAMFER_SEGMENT = 6.0
 closer ones."""
 SETTLED = 15
 """Iterations after which strands are where they belong."""
+EXCHANGES, EXCHANGED_SHARE, LEAST_BETWEEN = 3, 0.36, 5
+"""How often tips are exchanged, the share of all iterations before the last of these, and how many lie between two at least."""
+FIRST_SHARE = 0.24
+"""Share of the iterations before them."""
+LOOSE = 1.5
+"""`stiffness` by then, voxel: each point lies where there is hair, not where the strand's smoothness takes it."""
+AGAIN_SMOOTH = 2.0
+"""Times `stiffness` that the last fit sets out with."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,9 @@ def refine(
     if settings.iterations and len(kept):
         step = part(progress, 0.15, 0.85)
         traced = kept.strand_attributes.get("guide")
-        points, counts = _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, step, traced)
+        points, offsets, counts = _moved(
+            points, offsets, density, hair_level, profile, boundary, settings, seed, device, step, traced
+        )
         tally |= counts
         if judged:
             points, offsets, kept, counts = _pruned(
@@ -122,12 +133,47 @@ def _pruned(points, offsets, strands, density, profile, boundary, progress, reac
 
 
 def _moved(points, offsets, density, hair_level, profile, boundary, settings, seed, device, progress, traced):
-    """The control points after the chosen method, and its tally."""
+    """Control points and offsets after the chosen method, and its tally."""
     if settings.method == "chamfer":
         from .chamfer import fit_to_points  # torch takes seconds to import: only who asks for it pays
 
-        return fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, device, progress)
-    return fit_to_volume(points, offsets, density, profile, boundary, settings, device, progress, traced)
+        moved, tally = fit_to_points(points, offsets, density, hair_level, boundary, settings, seed, device, progress)
+        return moved, offsets, tally
+    return _fitted(points, offsets, density, profile, boundary, settings, device, progress, traced)
+
+
+def _fitted(points, offsets, density, profile, boundary, settings, device, progress, traced):
+    """Control points and offsets after the fit to the volume, with tips of `traced` strands exchanged on the way; its tally."""
+    plan = _plan(settings, traced is not None and bool(np.any(traced)))
+    done = np.cumsum([0] + [wanted.iterations for wanted, _, _ in plan]) / settings.iterations
+    tally: dict[str, int] = {}
+    for number, (wanted, first, exchanges) in enumerate(plan):
+        step = part(progress, done[number], done[number + 1])
+        fitting = part(step, 0.0, 0.7) if exchanges else step
+        points, counts = fit_to_volume(points, offsets, density, profile, boundary, wanted, device, fitting, traced, first)
+        if exchanges:
+            points, offsets, made = exchange_tips(points, offsets, density.spacing, traced, part(step, 0.7, 1.0))
+            counts["tips exchanged"] = tally.get("tips exchanged", 0) + made
+        counts["iterations"] += tally.get("iterations", 0)
+        tally = tally | counts | {name: value for name, value in tally.items() if name.startswith("misfit before")}
+    return points, offsets, tally
+
+
+def _plan(settings: RefinementSettings, traced: bool) -> list[tuple[RefinementSettings, float, bool]]:
+    """The fits in their order: (settings, times their stiffness at first, whether tips are exchanged behind it)."""
+    loose = round(EXCHANGED_SHARE * settings.iterations)
+    count = min(EXCHANGES, loose // LEAST_BETWEEN) if settings.exchange and traced else 0
+    if not count:
+        return [(settings, FIRST_SMOOTH, False)]
+    first = round(FIRST_SHARE * settings.iterations)
+    each = loose // count
+    between = replace(settings, iterations=each, stiffness=min(LOOSE, settings.stiffness), coarsest=1.0)
+    last = replace(settings, iterations=settings.iterations - first - count * each, coarsest=1.0)
+    return (
+        [(replace(settings, iterations=first), FIRST_SMOOTH, False)]
+        + count * [(between, 1.0, True)]
+        + [(last, AGAIN_SMOOTH, False)]
+    )
 
 
 def _supported(strands: Strands, density: BrickVolume, hair_level: float) -> Strands:

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ct2hair_addon.refinement.boundary import MARGIN, Boundary
 from ct2hair_addon.refinement.curves import _evaluate_cubics, control_points, local_curvature, polylines, segment_lengths
 from ct2hair_addon.refinement.fit import SMOOTH_TURN, pyramid, shares
-from ct2hair_addon.refinement.motion import _solve_bands, keep_lengths, smooth_step
+from ct2hair_addon.refinement.motion import solve_bands, keep_lengths, smooth_step
 from ct2hair_addon.refinement.splat import render
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume
@@ -23,7 +23,7 @@ def test_the_bands_are_solved_as_the_whole_matrix(size):
     whole, right = factor @ factor.T, rng.normal(size=(size, 3))
     band = np.array([[whole[i, i + k] if i + k < size else 0.0 for k in range(4)] for i in range(size)])
     found = right.copy()
-    _solve_bands(band, found)
+    solve_bands(band, found)
     np.testing.assert_allclose(found, np.linalg.solve(whole, right), atol=1e-9)
 
 
