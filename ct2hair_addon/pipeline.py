@@ -262,8 +262,9 @@ class _Job:
         share = TRACING if rounds else 1.0
         guides = self.checkpoints.load(TRACED, self.keys["guides"])
         if guides is None:
+            step = part(progress, 0.0, share)
             guides = trace_guides(
-                density, level, fields.pop(), head, settings.guides, seed, part(progress, 0.0, share), wig.knots, lone, counted
+                density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, counted=counted
             )
             if rounds:
                 self.checkpoints.save(TRACED, self.keys["guides"], guides)
@@ -289,7 +290,7 @@ class _Job:
             fields = [self._orientation(density, level, part(progress, 0.65, 0.75))]
         step, wanted = part(progress, 0.75, 1.0), settings.guides
         amended = amend_guides(
-            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted
+            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted=counted
         )
         tally = {f"amended {number}: {name}": count for name, count in (fitted.tally | cut | amended.tally).items()}
         return Guides(amended.strands, guides.profile, guides.tally | tally)

@@ -13,6 +13,7 @@ import torch
 from ct2hair_addon import cli, pipeline
 from ct2hair_addon.errors import Cancelled, CT2HairError, ScanError
 from ct2hair_addon.evaluation import evaluate, hairstyle, synthesize
+from ct2hair_addon.evaluation.scores import strand_scores
 from ct2hair_addon.head import Head, load_obj, template_head
 from ct2hair_addon.jobs import start
 from ct2hair_addon.orientation.field import LINES
@@ -181,3 +182,28 @@ def test_a_card_that_is_not_there_is_said_at_once(scan, tmp_path, monkeypatch):
     with pytest.raises(CT2HairError, match=r"run\.device is cuda"):
         pipeline.reconstruct(scan, tmp_path / "out", SETTINGS.changed({"run.device": "cuda"}))
     assert not (tmp_path / "out").exists()
+
+
+def test_guides_are_amended_and_an_interrupted_amendment_goes_on_from_the_traced_ones(scan, tmp_path, monkeypatch):
+    settings = SETTINGS.changed({"guides.amend": 1})
+    traced = tmp_path / "out" / "checkpoints" / "traced.npz"
+    rooting, tracing = pipeline.amend_guides, pipeline.trace_guides
+
+    def cut_off(*args, **kwargs):
+        raise Cancelled
+
+    monkeypatch.setattr(pipeline, "amend_guides", cut_off)
+    with pytest.raises(Cancelled):
+        pipeline.reconstruct(scan, tmp_path / "out", settings, until="guides")
+    assert traced.exists() and not (tmp_path / "out" / "guides.npz").exists()
+    monkeypatch.setattr(pipeline, "amend_guides", rooting)
+    monkeypatch.setattr(pipeline, "trace_guides", cut_off)
+    assert pipeline.reconstruct(scan, tmp_path / "out", settings, until="guides") is None
+    assert not traced.exists()
+    monkeypatch.setattr(pipeline, "trace_guides", tracing)
+    truth = Strands.load(scan.with_suffix(".strands.npz"))
+    amended = Strands.load(tmp_path / "out" / "guides.npz")
+    assert pipeline.reconstruct(scan, tmp_path / "plain", SETTINGS, until="guides") is None
+    plain = Strands.load(tmp_path / "plain" / "guides.npz")
+    scores = [strand_scores(truth, guides)["strand"]["1/10"]["f"] for guides in (plain, amended)]
+    assert scores[1] > scores[0] + 0.01

@@ -12,7 +12,7 @@ from ..progress import Progress, part, silent
 from ..settings import GuideSettings
 from ..strands import Strands, concatenate
 from ..volume.grid import BrickVolume
-from ..volume.strand_signal import StrandProfile, data_floor
+from ..volume.strand_signal import StrandProfile, data_floor, support_along
 from .direction import fine_ends, signs
 from .growing import follow_to_scalp, grow_to_root
 from .knots import strands_by_knots
@@ -139,7 +139,7 @@ def amend_guides(
     counted: bool = True,
 ) -> Guides:
     """Guide strands from `pieces` of fitted ones (mm) and what is traced in the `rest` of the scan, which is used up: both are
-    joined and rooted as in `trace_guides`, where the other arguments are explained."""
+    joined and rooted as in `trace_guides`, where the other arguments are explained. Their support is what the scan backs."""
     settings = settings or GuideSettings()
     seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
     del field
@@ -153,8 +153,10 @@ def amend_guides(
     strands, tally = root_segments(
         segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted
     )
+    support = support_along(strands, density, hair_level)[1] if len(strands) else np.zeros(0, np.float32)
     progress(1, 1)
-    return Guides(strands, profile, {"pieces": len(pieces), "traced beside them": len(traced)} | tally)
+    tally = {"pieces": len(pieces), "traced beside them": len(traced)} | tally
+    return Guides(strands.with_attributes(support=support), profile, tally)
 
 
 def root_segments(

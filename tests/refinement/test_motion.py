@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ct2hair_addon.refinement.boundary import MARGIN, Boundary
 from ct2hair_addon.refinement.curves import _evaluate_cubics, control_points, local_curvature, polylines, segment_lengths
 from ct2hair_addon.refinement.fit import SMOOTH_TURN, pyramid, shares
-from ct2hair_addon.refinement.motion import solve_bands, keep_lengths, smooth_step
+from ct2hair_addon.refinement.motion import keep_lengths, smooth_step, solve_bands
 from ct2hair_addon.refinement.splat import render
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume
