@@ -169,7 +169,7 @@ class RefinementSettings:
         "volume: all strands against the density itself; chamfer: the paper's, points of strands against points of the scan",
         choices=("volume", "chamfer"),
     )
-    iterations: int = parameter(50, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
+    iterations: int = parameter(30, "steps of the optimiser at most; 0 leaves the dense strands as they are", low=0, high=1000)
     points: int = parameter(128, "control points of each strand at most", low=8, high=256)
     prune: bool = parameter(
         True, "volume: made-up strands and tips that explain nothing of the scan go, and traced strands that only double others"
@@ -345,7 +345,7 @@ _TYPES = {"float": float, "int": int, "str": str, "bool": bool}
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"guides.amend": 0, "refinement.iterations": 15, "refinement.points": 64},
     "standard": {},
-    "final": {"refinement.iterations": 120, "refinement.points": 192},
+    "final": {"guides.amend": 2, "refinement.iterations": 60, "refinement.points": 192},
     "paper": {
         "orientation.sigma": 0.0,
         "orientation.rho": 1.5,

@@ -31,7 +31,7 @@ SMOOTH, TURN = 6.0, 0.5
 """voxel; the length that a curve is smoothed by, and radians that hair turns over it at most: less where it bends more."""
 LEAST_GAIN = 0.4
 """voxel^2; an exchange must make the two curves better by as much."""
-ASKED_EVERY, KNOWN_EVERY = 3, 2
+ASKED_EVERY, KNOWN_EVERY = 4, 2
 """voxel along a strand from one place to the next where neighbours are looked for, and between the points of theirs known."""
 NEAREST = 8
 """Points looked at there."""
@@ -54,18 +54,18 @@ def exchange_tips(
     known = places[::KNOWN_EVERY]
     tree = cKDTree(lines[known])
     places = places[::ASKED_EVERY]
-    left = np.zeros((0, 2), np.int64)
+    asked, left = np.ones(len(lines), bool), np.zeros((0, 2), np.int64)
     made = 0
     for number in range(ROUNDS):
         progress(number, ROUNDS)
-        pairs, gain = _worth_it(lines, following, previous, owner, tree, known, places, left)
+        pairs, gain = _worth_it(lines, following, previous, owner, tree, known, places, asked, left)
         if not len(pairs):
             break
         order = np.argsort(-gain, kind="stable")
-        touched = np.zeros(len(lines), bool)
-        done, waits = _exchange(lines, following, previous, owner, pairs[order], touched)
+        asked = np.zeros(len(lines), bool)
+        done, waits = _exchange(lines, following, previous, owner, pairs[order], asked)
         made += done
-        places, left = np.flatnonzero(touched)[::ASKED_EVERY], pairs[order][waits]
+        places, left = np.flatnonzero(asked)[::ASKED_EVERY], pairs[order][waits]
     chained, chained_starts = _chains(lines, following, starts)
     progress(1.0, 1.0)
     most = int(np.diff(offsets).max(initial=2))
@@ -80,15 +80,17 @@ def _linked(count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return following, previous, np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
 
 
-def _worth_it(lines, following, previous, owner, tree, known, places, left) -> tuple[np.ndarray, np.ndarray]:
-    """(pairs (J, 2) of points whose strands are better with tips exchanged there, gain (J,)): of `left` and at `places`."""
+def _worth_it(lines, following, previous, owner, tree, known, places, asked, left) -> tuple[np.ndarray, np.ndarray]:
+    """(pairs (J, 2) of points whose strands are better with tips exchanged there, gain (J,)): of `left` and at `places`, some
+    of the points that are `asked` (K,) bool."""
     found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
     for start in range(0, max(len(places), 1), CHUNK):
         some = places[start : start + CHUNK]
         distance, near = tree.query(lines[some], k=NEAREST, distance_upper_bound=REACH, workers=-1)
         row, column = np.nonzero(np.isfinite(distance))
         one, other = some[row], known[near[row, column]]
-        apart = owner[one] != owner[other]
+        # of two that are asked alike, one side will do
+        apart = (owner[one] < owner[other]) | (~asked[other] & (owner[one] != owner[other]))
         one, other, distance = one[apart], other[apart], distance[row, column][apart]
         order = np.lexsort((distance, owner[other], one))
         one, other = one[order], other[order]
@@ -107,7 +109,7 @@ def _worth_it(lines, following, previous, owner, tree, known, places, left) -> t
 @numba.njit(cache=True, parallel=True)
 def _weigh(lines, following, previous, pairs, gain):
     """How much better two strands are with tips exchanged at each of `pairs`, whose second is moved to where it is nearest to
-    the first; -1 where they can't be."""
+    the first; -1 where they can't be, and anything below LEAST_GAIN where that is not worth it."""
     for n in numba.prange(len(pairs)):
         one = pairs[n, 0]
         other = _nearest(lines, one, pairs[n, 1], following, previous)
@@ -133,9 +135,13 @@ def _weigh(lines, following, previous, pairs, gain):
         basis = np.stack((side, np.cross(along, side)))
         bend = max(_bend(lines, heads[0], tails[0]), _bend(lines, heads[1], tails[1]))
         stiff = min(SMOOTH, TURN / max(bend, 1e-6)) ** 6
-        own = _roughness(lines, heads[0], tails[0], basis, stiff) + _roughness(lines, heads[1], tails[1], basis, stiff)
-        new = _roughness(lines, heads[0], tails[1], basis, stiff) + _roughness(lines, heads[1], tails[0], basis, stiff)
-        gain[n] = own - new
+        worth = _roughness(lines, heads[0], tails[0], basis, stiff) + _roughness(lines, heads[1], tails[1], basis, stiff)
+        # the roughness of what would be is not below 0: most places need no second look
+        if worth >= LEAST_GAIN:
+            worth -= _roughness(lines, heads[0], tails[1], basis, stiff)
+        if worth >= LEAST_GAIN:
+            worth -= _roughness(lines, heads[1], tails[0], basis, stiff)
+        gain[n] = worth
 
 
 @numba.njit(cache=True)
