@@ -35,7 +35,7 @@ from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_sc
 from .volume.strand_signal import StrandProfile, lone_profile
 
 STAGES = ("scan", "head", "orientation", "guides", "dense", "refinement", "result")
-SHARES = dict(zip(STAGES, (0.15, 0.08, 0.08, 0.35, 0.08, 0.22, 0.04), strict=True))
+SHARES = dict(zip(STAGES, (0.09, 0.08, 0.04, 0.54, 0.04, 0.18, 0.03), strict=True))
 """Each stage's usual share of the time, for the total progress."""
 TEXTS = {
     "scan": "reading the scan",

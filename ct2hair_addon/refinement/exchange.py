@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..progress import Progress, silent
+from ..progress import Progress, part, silent
 from ..strands import Strands, offsets_from_counts
 from .curves import control_points, even_lines
 from .motion import solve_bands
@@ -36,16 +36,16 @@ ASKED_EVERY, KNOWN_EVERY = 4, 2
 NEAREST = 8
 """Points looked at there."""
 ROUNDS = 12
-CHUNK = 200_000
+CHUNK = 100_000
 """Places asked at once: what bounds memory."""
 
 
 def exchange_tips(
-    points: np.ndarray, offsets: np.ndarray, voxel: float, may: np.ndarray, progress: Progress = silent
+    points: np.ndarray, offsets: np.ndarray, voxel: float, may: np.ndarray, most: int, progress: Progress = silent
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Control points (M, 3) mm and offsets (N + 1,) of the strands with tips exchanged, and how many exchanges were made.
 
-    voxel: mm. may: (N,) bool, strands that take part. Roots and their order stay. The same on any number of threads.
+    voxel: mm. may: (N,) bool, strands that take part. most: control points of a strand. Roots and their order stay. The same on any number of threads.
     """
     lines, starts = even_lines(points, offsets, voxel)
     lines /= voxel
@@ -57,8 +57,9 @@ def exchange_tips(
     asked, left = np.ones(len(lines), bool), np.zeros((0, 2), np.int64)
     made = 0
     for number in range(ROUNDS):
-        progress(number, ROUNDS)
-        pairs, gain = _worth_it(lines, following, previous, owner, tree, known, places, asked, left)
+        # most of the work is in the first round, and half as much in each one that follows
+        step = part(progress, 1.0 - 0.5**number, 1.0 - 0.5 ** (number + 1))
+        pairs, gain = _worth_it(lines, following, previous, owner, tree, known, places, asked, left, step)
         if not len(pairs):
             break
         order = np.argsort(-gain, kind="stable")
@@ -68,7 +69,6 @@ def exchange_tips(
         places, left = np.flatnonzero(asked)[::ASKED_EVERY], pairs[order][waits]
     chained, chained_starts = _chains(lines, following, starts)
     progress(1.0, 1.0)
-    most = int(np.diff(offsets).max(initial=2))
     return *control_points(Strands((chained * voxel).astype(np.float32), chained_starts), most), made
 
 
@@ -80,11 +80,12 @@ def _linked(count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return following, previous, np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
 
 
-def _worth_it(lines, following, previous, owner, tree, known, places, asked, left) -> tuple[np.ndarray, np.ndarray]:
+def _worth_it(lines, following, previous, owner, tree, known, places, asked, left, progress) -> tuple[np.ndarray, np.ndarray]:
     """(pairs (J, 2) of points whose strands are better with tips exchanged there, gain (J,)): of `left` and at `places`, some
     of the points that are `asked` (K,) bool."""
     found = [(np.zeros((0, 2), np.int64), np.zeros(0))]
     for start in range(0, max(len(places), 1), CHUNK):
+        progress(start, len(places))
         some = places[start : start + CHUNK]
         distance, near = tree.query(lines[some], k=NEAREST, distance_upper_bound=REACH, workers=-1)
         row, column = np.nonzero(np.isfinite(distance))

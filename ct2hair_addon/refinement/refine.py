@@ -152,7 +152,8 @@ def _fitted(points, offsets, density, profile, boundary, settings, device, progr
         fitting = part(step, 0.0, 0.7) if exchanges else step
         points, counts = fit_to_volume(points, offsets, density, profile, boundary, wanted, device, fitting, traced, first)
         if exchanges:
-            points, offsets, made = exchange_tips(points, offsets, density.spacing, traced, part(step, 0.7, 1.0))
+            last = part(step, 0.7, 1.0)
+            points, offsets, made = exchange_tips(points, offsets, density.spacing, traced, settings.points, last)
             counts["tips exchanged"] = tally.get("tips exchanged", 0) + made
         counts["iterations"] += tally.get("iterations", 0)
         tally = tally | counts | {name: value for name, value in tally.items() if name.startswith("misfit before")}

@@ -23,6 +23,8 @@ LEAST_SURPLUS = 4.0
 """voxel; a stretch is cut out where so much of a lone strand's length is won by it."""
 MOST_CUTS = 8
 """Stretches cut out of one strand."""
+CHUNK = 1000
+"""Strands judged in one call: a fraction of a second."""
 LEAST_POINTS = 3
 """Control points of what is kept."""
 
@@ -46,14 +48,15 @@ def without_surplus(
     edges[offsets[1:] - 1] = False
     whole = int(edges.sum())
     order = np.argsort(earned, kind="stable")
-    _cut(
-        density.table, excess, density.bricks, voxels, offsets, visible, order, mark.peak, mark.seen, mark.blur, edges
-    )  # fmt: skip
+    for start in range(0, len(order), CHUNK):
+        progress(0.5 + 0.2 * start / len(order), 1.0)
+        some = order[start : start + CHUNK]
+        _cut(density.table, excess, density.bricks, voxels, offsets, visible, some, mark.peak, mark.seen, mark.blur, edges)
     del excess
     tally = {"stretches cut out, control points": whole - int(edges.sum())}
     points, offsets, visible = _runs(points, offsets, visible, edges)
     tally["pieces kept"] = len(offsets) - 1
-    rest, _ = excess_of(density.to_voxel(points), offsets, visible, density, profile, 0.0, part(progress, 0.5, 1.0))
+    rest, _ = excess_of(density.to_voxel(points), offsets, visible, density, profile, 0.0, part(progress, 0.7, 1.0))
     np.negative(rest, out=rest)
     progress(1.0, 1.0)
     return Strands(*polylines(points, offsets)), BrickVolume(density.table, rest, density.spacing, density.origin), tally
