@@ -45,7 +45,8 @@ def exchange_tips(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Control points (M, 3) mm and offsets (N + 1,) of the strands with tips exchanged, and how many exchanges were made.
 
-    voxel: mm. may: (N,) bool, strands that take part. most: control points of a strand. Roots and their order stay. The same on any number of threads.
+    voxel: mm. may: (N,) bool, strands that take part. most: control points of a strand at most. Roots and their order stay.
+    The same on any number of threads.
     """
     lines, starts = even_lines(points, offsets, voxel)
     lines /= voxel

@@ -24,7 +24,7 @@ def straight(slope: float, place: float = 0.0) -> np.ndarray:
 
 def exchanged(points, offsets, may=None):
     may = np.ones(len(offsets) - 1, bool) if may is None else np.array(may)
-    return exchange_tips(points, offsets, VOXEL, may, 128)
+    return exchange_tips(points, offsets, VOXEL, may, int(np.diff(offsets).max(initial=2)))
 
 
 def bounced(slope: float = 0.1, round_off: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
