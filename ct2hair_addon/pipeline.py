@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
@@ -28,7 +29,7 @@ from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
-from .refinement import Refined, check_device, refine, without_surplus
+from .refinement import Refined, check_device, refine, unexplained, without_surplus
 from .settings import STOPS, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
@@ -283,12 +284,13 @@ class _Job:
         fitted = refine(traced, density, level, head, settings.refinement, seed, step, profile, device, lone)
         if not len(fitted.strands):
             return guides
-        pieces, rest, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
+        pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
         # in a list, to be handed over and held no longer
         fields = [self.checkpoints.load("orientation", self.keys["orientation"])]
         if fields[0] is None:
             fields = [self._orientation(density, level, part(progress, 0.65, 0.75))]
         step, wanted = part(progress, 0.75, 1.0), settings.guides
+        rest = partial(unexplained, pieces, density, level, head, profile)
         amended = amend_guides(
             pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted=counted
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -126,7 +127,7 @@ def trace_guides(
 
 def amend_guides(
     pieces: Strands,
-    rest: BrickVolume,
+    rest: Callable[[], BrickVolume],
     density: BrickVolume,
     hair_level: float,
     field: HairField,
@@ -138,14 +139,18 @@ def amend_guides(
     knots: np.ndarray | None = None,
     counted: bool = True,
 ) -> Guides:
-    """Guide strands from `pieces` of fitted ones (mm) and what is traced in the `rest` of the scan, which is used up: both are
-    joined and rooted as in `trace_guides`, where the other arguments are explained. Their support is what the scan backs."""
+    """Guide strands from `pieces` of fitted ones (mm) and what is traced in the rest of the scan: both are joined and rooted as
+    in `trace_guides`, where the other arguments are explained. Their support is what the scan backs.
+
+    rest: makes the scan without what the pieces explain, when the orientation field is needed no more; it is used up.
+    """
     settings = settings or GuideSettings()
     seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
     del field
+    rest = rest()
     order = seed_order(rest, *seeds, profile, part(progress, 0.0, 0.2))
     found = trace_segments(rest, way, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.2, 0.5))
-    del seeds, way
+    del seeds, way, rest
     traced = Strands(density.to_scan(found.points), found.offsets)
     segments = concatenate([pieces.resampled_by_step(density.spacing), traced])
     floor = data_floor(density, hair_level, head)

@@ -3,6 +3,6 @@
 from .agreement import scan_agreement
 from .device import check_device
 from .refine import Refined, refine
-from .surplus import without_surplus
+from .surplus import unexplained, without_surplus
 
-__all__ = ["Refined", "check_device", "refine", "scan_agreement", "without_surplus"]
+__all__ = ["Refined", "check_device", "refine", "scan_agreement", "unexplained", "without_surplus"]

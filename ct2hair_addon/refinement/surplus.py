@@ -25,23 +25,20 @@ MOST_CUTS = 8
 """Stretches cut out of one strand."""
 CHUNK = 1000
 """Strands judged in one call: a fraction of a second."""
-LEAST_POINTS = 3
-"""Control points of what is kept."""
+LEAST_POINTS, MOST_POINTS = 3, 256
+"""Control points of what is kept, and of a strand."""
 
 
 def without_surplus(
     strands: Strands, density: BrickVolume, hair_level: float, head, profile: StrandProfile, progress: Progress = silent
-) -> tuple[Strands, BrickVolume, dict[str, int]]:
-    """(the strands (mm, root first) in pieces, without the stretches that the scan has no hair left for; the scan without what
-    these explain, float32; a tally).
+) -> tuple[Strands, dict[str, int]]:
+    """The strands (mm, root first) in pieces, without the stretches that the scan has no hair left for; and a tally.
 
     The strands should have been fitted to the scan (`refine`). density, hair_level, head: as there; profile: a lone strand's.
     """
-    points, offsets = control_points(strands, 256)
-    boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
-    visible = boundary.look(points)
+    points, offsets, visible = _seen(strands, density, hair_level, head)
     voxels = density.to_voxel(points)
-    excess, mark = excess_of(voxels, offsets, visible, density, profile, REACH, part(progress, 0.0, 0.5))
+    excess, mark = excess_of(voxels, offsets, visible, density, profile, REACH, part(progress, 0.0, 0.7))
     earned = np.empty(len(offsets) - 1)
     earn(density.table, excess, density.bricks, 0.0, voxels, offsets, visible, mark.peak, mark.seen, earned)
     edges = np.ones(len(points), bool)
@@ -49,21 +46,35 @@ def without_surplus(
     whole = int(edges.sum())
     order = np.argsort(earned, kind="stable")
     for start in range(0, len(order), CHUNK):
-        progress(0.5 + 0.2 * start / len(order), 1.0)
+        progress(0.7 + 0.3 * start / len(order), 1.0)
         some = order[start : start + CHUNK]
         _cut(density.table, excess, density.bricks, voxels, offsets, visible, some, mark.peak, mark.seen, mark.blur, edges)
-    del excess
     tally = {"stretches cut out, control points": whole - int(edges.sum())}
-    points, offsets, visible = _runs(points, offsets, visible, edges)
+    points, offsets = _runs(points, offsets, edges)
     tally["pieces kept"] = len(offsets) - 1
-    rest, _ = excess_of(density.to_voxel(points), offsets, visible, density, profile, 0.0, part(progress, 0.7, 1.0))
-    np.negative(rest, out=rest)
     progress(1.0, 1.0)
-    return Strands(*polylines(points, offsets)), BrickVolume(density.table, rest, density.spacing, density.origin), tally
+    return Strands(*polylines(points, offsets)), tally
 
 
-def _runs(points, offsets, visible, edges):
-    """(points, offsets, visible) of the runs of `edges` (M,) bool, each from its point to the next."""
+def unexplained(
+    strands: Strands, density: BrickVolume, hair_level: float, head, profile: StrandProfile, progress: Progress = silent
+) -> BrickVolume:
+    """The scan without what the strands (mm) explain of it, float32, negative where that is more. The rest as above."""
+    points, offsets, visible = _seen(strands, density, hair_level, head)
+    rest, _ = excess_of(density.to_voxel(points), offsets, visible, density, profile, 0.0, progress)
+    np.negative(rest, out=rest)
+    return BrickVolume(density.table, rest, density.spacing, density.origin)
+
+
+def _seen(strands: Strands, density: BrickVolume, hair_level: float, head):
+    """(points, offsets, visible) of the strands' control points."""
+    points, offsets = control_points(strands, MOST_POINTS)
+    boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
+    return points, offsets, boundary.look(points)
+
+
+def _runs(points, offsets, edges):
+    """(points, offsets) of the runs of `edges` (M,) bool, each from its point to the next."""
     behind = np.concatenate([[False], edges[:-1]])
     first = (edges & ~behind)[edges | behind]
     kept = edges | behind
@@ -71,7 +82,7 @@ def _runs(points, offsets, visible, edges):
     counts = np.bincount(run)
     long = counts >= LEAST_POINTS
     chosen = np.flatnonzero(kept)[long[run]] if len(run) else np.zeros(0, np.int64)
-    return points[chosen], offsets_from_counts(counts[long]), visible[chosen]
+    return points[chosen], offsets_from_counts(counts[long])
 
 
 @numba.njit(cache=True, nogil=True)

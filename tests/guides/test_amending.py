@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from ct2hair_addon.evaluation.scores import strand_scores
 from ct2hair_addon.guides import amend_guides
 from ct2hair_addon.head import Head
 from ct2hair_addon.orientation import orientation_field
-from ct2hair_addon.refinement import without_surplus
+from ct2hair_addon.refinement import unexplained, without_surplus
 from ct2hair_addon.settings import GuideSettings
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume
@@ -46,7 +48,8 @@ def test_what_was_cut_out_is_traced_anew_and_joined(ball, hair, scan):
     # of every fourth strand nothing is left, of a third of the others the first half
     kept = [line for n, line in enumerate(hair.polylines()) if n % 4 != 0]
     kept = [line[:60] if n % 3 == 0 else line for n, line in enumerate(kept)]
-    pieces, rest, _ = without_surplus(Strands.from_polylines(kept), scan, LEVEL, ball, profile)
+    pieces, _ = without_surplus(Strands.from_polylines(kept), scan, LEVEL, ball, profile)
+    rest = partial(unexplained, pieces, scan, LEVEL, ball, profile)
     assert len(pieces) == 30
     guides = amend_guides(
         pieces, rest, scan, LEVEL, orientation_field(scan, LEVEL), ball, profile, GuideSettings(), counted=False

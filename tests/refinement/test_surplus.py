@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.evaluation import render_density
-from ct2hair_addon.refinement import without_surplus
+from ct2hair_addon.refinement import unexplained, without_surplus
 from ct2hair_addon.strands import Strands, concatenate
 from ct2hair_addon.volume.grid import trilinear
 
@@ -41,10 +41,18 @@ def left_at(rest, place: float, along: float, peak: float) -> float:
     return trilinear(rest.table, rest.bricks, np.float32(0.0), *point) / peak
 
 
+def judged(strands: Strands, scan, head, profile):
+    """(pieces, what is left of the scan, control points cut out)"""
+    pieces, tally = without_surplus(strands, scan, LEVEL, head, profile)
+    assert tally["pieces kept"] == len(pieces)
+    rest = unexplained(pieces, scan, LEVEL, head, profile)
+    return pieces, rest, tally["stretches cut out, control points"]
+
+
 def test_strands_that_explain_the_scan_stay_and_leave_nothing(scan, head, profile):
     given = concatenate([*map(lane, LANES)])
-    pieces, rest, tally = without_surplus(given, scan, LEVEL, head, profile)
-    assert tally["stretches cut out, control points"] == 0
+    pieces, rest, cut = judged(given, scan, head, profile)
+    assert cut == 0
     assert len(pieces) == 2
     np.testing.assert_allclose(pieces.lengths(), given.lengths(), rtol=1e-3)
     for place in LANES:
@@ -53,8 +61,8 @@ def test_strands_that_explain_the_scan_stay_and_leave_nothing(scan, head, profil
 
 
 def test_one_that_went_over_is_cut_where_it_doubles_and_its_own_way_is_left(scan, head, profile):
-    pieces, rest, tally = without_surplus(concatenate([lane(LANES[1]), hopped()]), scan, LEVEL, head, profile)
-    assert tally["stretches cut out, control points"] > 0
+    pieces, rest, cut = judged(concatenate([lane(LANES[1]), hopped()]), scan, head, profile)
+    assert cut > 0
     heights = [(part[0, 2] - 52.0, part[-1, 2] - 52.0) for part in np.split(pieces.points, pieces.offsets[1:-1])]
     assert pieces.lengths().sum() == pytest.approx(90.0, abs=8.0)  # of 60 and 60 mm, 30 are doubled
     assert min(low for low, _ in heights) < 1.0 and max(high for _, high in heights) > 59.0
@@ -67,6 +75,6 @@ def test_one_that_went_over_is_cut_where_it_doubles_and_its_own_way_is_left(scan
 
 def test_where_all_is_surplus_nothing_is_kept(scan, head, profile):
     away = lane(20.0)
-    pieces, rest, _ = without_surplus(away, scan, LEVEL, head, profile)
+    pieces, rest, _ = judged(away, scan, head, profile)
     assert len(pieces) == 0
     np.testing.assert_allclose(rest.bricks, scan.bricks, atol=1e-6)
