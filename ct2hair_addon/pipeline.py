@@ -30,7 +30,7 @@ from .measure import Meter, allowed_memory, machine_memory, needed_memory, relea
 from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
 from .refinement import Refined, check_device, refine, unexplained, without_surplus
-from .settings import STOPS, Settings
+from .settings import STOPS, RefinementSettings, Settings
 from .strands import Strands
 from .volume import BrickVolume, Thresholds, WigScan, find_thresholds, import_scan, open_scan, save_vdb
 from .volume.strand_signal import StrandProfile, lone_profile
@@ -47,6 +47,8 @@ TEXTS = {
     "refinement": "fitting strands to the scan",
     "result": "writing the result",
 }
+AMENDED_BY = RefinementSettings()
+"""How guides are fitted to be amended, whatever is wanted of the refinement: guides then depend on their own settings alone."""
 TRACED, TRACING = "traced", 0.5
 """The checkpoint within the guides' stage, and the share of the stage that lies before it."""
 
@@ -258,8 +260,7 @@ class _Job:
         """Traced guides, amended as often as the settings want it; the traced ones are kept until these are there."""
         settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
         counted = len(wig.solid_points) > 0
-        method = settings.guides.method == "trace" and settings.refinement.method == "volume"
-        rounds = settings.guides.amend if method else 0
+        rounds = settings.guides.amend if settings.guides.method == "trace" else 0
         share = TRACING if rounds else 1.0
         guides = self.checkpoints.load(TRACED, self.keys["guides"])
         if guides is None:
@@ -281,7 +282,7 @@ class _Job:
         traced = guides.strands.with_attributes(guide=np.ones(len(guides.strands), bool))
         profile = lone_profile(density, level, traced, lone, part(progress, 0.0, 0.05))
         device, step = settings.run.device, part(progress, 0.05, 0.6)
-        fitted = refine(traced, density, level, head, settings.refinement, seed, step, profile, device, lone)
+        fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone)
         if not len(fitted.strands):
             return guides
         pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
@@ -363,7 +364,6 @@ class _Job:
         depends["head"] = {"template": _digest(self.template.vertices, self.template.faces, self.template.scalp)}
         for stage in ("guides", "dense", "refinement"):
             depends[stage] = {"seed": self.settings.run.seed}
-        depends["guides"]["fit"] = dataclasses.asdict(self.settings.refinement)
         settings_of = {"dense": "interpolation"}
         keys, previous = {}, chained_key("", version=__version__)
         for stage, values in depends.items():
