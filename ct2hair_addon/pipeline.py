@@ -272,7 +272,7 @@ class _Job:
                 self.checkpoints.save(TRACED, self.keys["guides"], guides)
         fields.clear()
         for number in range(rounds if len(guides.strands) else 0):
-            step = part(progress, *(share + (1.0 - share) * np.array([number, number + 1]) / rounds))
+            step = part(part(progress, share, 1.0), number / rounds, (number + 1) / rounds)
             guides = self._amended(guides, number + 1, wig, density, head, step, counted)
         return guides
 

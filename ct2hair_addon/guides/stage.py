@@ -71,12 +71,19 @@ def find_segments(
     """
     profile = _profile(density, hair_level, seeds, peak)
     order = seed_order(density, *seeds, profile, part(progress, 0.0, 0.15))
-    residual = BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)
-    found = trace_segments(
-        residual, course, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.15, 1.0)
-    )
-    del residual  # points in millimetres are made in float64: together they were of the peak of memory
-    return Strands(density.to_scan(found.points), found.offsets), profile, found.tally
+    rest = [BrickVolume(density.table, density.bricks.astype(np.float32), density.spacing, density.origin)]
+    segments, tally = _traced(rest, density, course, seeds, order, profile, settings, part(progress, 0.15, 1.0))
+    return segments, profile, tally
+
+
+def _traced(rest, density, course, seeds, order, profile, settings, progress) -> tuple[Strands, dict[str, int]]:
+    """The pieces that a volume in the bricks of `density` shows, mm, and the tally of the tracing.
+
+    rest: a list of that volume alone, which is used up and let go of: points in millimetres are made in float64, and together
+    they were of the peak of memory.
+    """
+    found = trace_segments(rest.pop(), course, seeds.voxels, seeds.directions, order, profile, settings, progress)
+    return Strands(density.to_scan(found.points), found.offsets), found.tally
 
 
 def _profile(density: BrickVolume, hair_level: float, seeds: Seeds, peak: float) -> StrandProfile:
@@ -127,7 +134,7 @@ def trace_guides(
 
 def amend_guides(
     pieces: Strands,
-    rest: Callable[[], BrickVolume],
+    unexplained: Callable[[Progress], BrickVolume],
     density: BrickVolume,
     hair_level: float,
     field: HairField,
@@ -142,16 +149,15 @@ def amend_guides(
     """Guide strands from `pieces` of fitted ones (mm) and what is traced in the rest of the scan: both are joined and rooted as
     in `trace_guides`, where the other arguments are explained. Their support is what the scan backs.
 
-    rest: makes the scan without what the pieces explain, when the orientation field is needed no more; it is used up.
+    unexplained: makes the scan without what the pieces explain, once the orientation field is needed no more.
     """
     settings = settings or GuideSettings()
     seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
     del field
-    rest = rest()
-    order = seed_order(rest, *seeds, profile, part(progress, 0.0, 0.2))
-    found = trace_segments(rest, way, seeds.voxels, seeds.directions, order, profile, settings, part(progress, 0.2, 0.5))
-    del seeds, way, rest
-    traced = Strands(density.to_scan(found.points), found.offsets)
+    rest = [unexplained(part(progress, 0.0, 0.1))]
+    order = seed_order(rest[0], *seeds, profile, part(progress, 0.1, 0.2))
+    traced, _ = _traced(rest, density, way, seeds, order, profile, settings, part(progress, 0.2, 0.5))
+    del seeds, way
     segments = concatenate([pieces.resampled_by_step(density.spacing), traced])
     floor = data_floor(density, hair_level, head)
     step = part(progress, 0.5, 1.0)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ..progress import Progress, part, silent
 from ..strands import Strands, offsets_from_counts
 from .curves import control_points, even_lines
-from .motion import solve_bands
+from .motion import BAND, solve_bands, third
 
 REACH = 2.0
 """voxel; strands that come this close may have gone over to each other."""
@@ -120,7 +120,6 @@ def _weigh(lines, following, previous, pairs, gain):
         heads, tails = (_walk(one, previous), _walk(other, previous)), (_walk(one, following), _walk(other, following))
         if min(len(heads[0]), len(heads[1]), len(tails[0]), len(tails[1])) < HIDDEN + LEAST_SIDE:
             continue
-        along, parallel = np.zeros(3), 0.0
         a, b = np.zeros(3), np.zeros(3)
         for axis in range(3):
             a[axis] = lines[tails[0][1], axis] - lines[heads[0][1], axis]
@@ -135,8 +134,7 @@ def _weigh(lines, following, previous, pairs, gain):
         side -= (side * along).sum() * along
         side /= np.sqrt((side * side).sum())
         basis = np.stack((side, np.cross(along, side)))
-        bend = max(_bend(lines, heads[0], tails[0]), _bend(lines, heads[1], tails[1]))
-        stiff = min(SMOOTH, TURN / max(bend, 1e-6)) ** 6
+        stiff = min(_stiffness(lines, heads[0], tails[0]), _stiffness(lines, heads[1], tails[1]))
         worth = _roughness(lines, heads[0], tails[0], basis, stiff) + _roughness(lines, heads[1], tails[1], basis, stiff)
         # the roughness of what would be is not below 0: most places need no second look
         if worth >= LEAST_GAIN:
@@ -171,13 +169,13 @@ def _walk(start, onward):
 
 
 @numba.njit(cache=True)
-def _bend(lines, head, tail):
-    """1/voxel: the bend of a strand over the longer part of its window, by three points."""
+def _stiffness(lines, head, tail):
+    """What third differences weigh, voxel^6, on a curve that bends as a strand does, by three points of its window."""
     span = min(len(head), len(tail)) - 1
     square = 0.0
     for axis in range(3):
         square += (lines[head[span], axis] - 2.0 * lines[head[0], axis] + lines[tail[span], axis]) ** 2
-    return np.sqrt(square) / span**2
+    return min(SMOOTH, TURN / max(np.sqrt(square) / span**2, 1e-6)) ** 6
 
 
 @numba.njit(cache=True)
@@ -198,23 +196,25 @@ def _roughness(lines, head, tail, basis, stiff):
 def _smooth_curve(given, weight, stiff, curve):
     """Fill `curve` (n, c) with the least of sum weight |curve - given|^2 + stiff |third difference|^2, and return that."""
     size, axes = given.shape
-    third = (-1.0, 3.0, -3.0, 1.0)
-    band = np.zeros((size, 4))
+    band = np.zeros((size, BAND + 1))
     for i in range(size):
         band[i, 0] = weight[i] + 1e-9
         for axis in range(axes):
             curve[i, axis] = weight[i] * given[i, axis]
-    for i in range(size - 3):
-        for p in range(4):
-            for q in range(p, 4):
-                band[i + p, q - p] += stiff * third[p] * third[q]
+    for i in range(size - BAND):
+        for p in range(BAND + 1):
+            for q in range(p, BAND + 1):
+                band[i + p, q - p] += stiff * third(p) * third(q)
     solve_bands(band, curve)
     total = 0.0
     for axis in range(axes):
         for i in range(size):
             total += weight[i] * (curve[i, axis] - given[i, axis]) ** 2
-        for i in range(size - 3):
-            total += stiff * (curve[i + 3, axis] - 3.0 * curve[i + 2, axis] + 3.0 * curve[i + 1, axis] - curve[i, axis]) ** 2
+        for i in range(size - BAND):
+            change = 0.0
+            for p in range(BAND + 1):
+                change += third(p) * curve[i + p, axis]
+            total += stiff * change**2
     return total
 
 
@@ -259,8 +259,7 @@ def _mend(lines, head, tail):
         given[m] = lines[index[m]]
         if -HIDDEN <= m - len(head) + 1 <= HIDDEN + 1:
             weight[m] = 0.0
-    bend = _bend(lines, head, tail)
-    _smooth_curve(given, weight, min(SMOOTH, TURN / max(bend, 1e-6)) ** 6, curve)
+    _smooth_curve(given, weight, _stiffness(lines, head, tail), curve)
     for m in range(size):
         if weight[m] == 0.0:
             lines[index[m]] = curve[m]

@@ -128,13 +128,13 @@ def smooth_step(points, rest, offsets, forces, weights, smooth, rate, friction, 
             a = min((0.5 * (smooth[start + i + 1] + smooth[start + i + 2]) / step) ** 6, 1e8)
             for p in range(BAND + 1):
                 for q in range(p, BAND + 1):
-                    band[i + p, q - p] += a * _third(p) * _third(q)
+                    band[i + p, q - p] += a * third(p) * third(q)
             for axis in range(3):
                 change = 0.0
                 for p in range(BAND + 1):
-                    change += _third(p) * (points[start + i + p, axis] - rest[start + i + p, axis])
+                    change += third(p) * (points[start + i + p, axis] - rest[start + i + p, axis])
                 for p in range(BAND + 1):
-                    right[i + p, axis] -= a * _third(p) * change
+                    right[i + p, axis] -= a * third(p) * change
         # The root: a row of its own.
         band[0, :] = 0.0
         band[0, 0] = 1.0
@@ -154,7 +154,7 @@ def smooth_step(points, rest, offsets, forces, weights, smooth, rate, friction, 
 
 
 @numba.njit(cache=True, inline="always")
-def _third(i):
+def third(i):
     """The weights of a third difference."""
     return (-1.0, 3.0, -3.0, 1.0)[i]
 

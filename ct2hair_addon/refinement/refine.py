@@ -170,11 +170,8 @@ def _plan(settings: RefinementSettings, traced: bool) -> list[tuple[RefinementSe
     each = loose // count
     between = replace(settings, iterations=each, stiffness=min(LOOSE, settings.stiffness), coarsest=1.0)
     last = replace(settings, iterations=settings.iterations - first - count * each, coarsest=1.0)
-    return (
-        [(replace(settings, iterations=first), FIRST_SMOOTH, False)]
-        + count * [(between, 1.0, True)]
-        + [(last, AGAIN_SMOOTH, False)]
-    )
+    set_out = replace(settings, iterations=first)
+    return [(set_out, FIRST_SMOOTH, False), *count * [(between, 1.0, True)], (last, AGAIN_SMOOTH, False)]
 
 
 def _supported(strands: Strands, density: BrickVolume, hair_level: float) -> Strands:

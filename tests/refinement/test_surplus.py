@@ -25,9 +25,9 @@ def lane(place: float) -> Strands:
     return path(np.full_like(ALONG, place))
 
 
-def hopped(way: int = 1) -> Strands:
+def hopped() -> Strands:
     """From one lane over to the other at 30 mm."""
-    return path(LANES[0] + (LANES[1] - LANES[0]) / (1.0 + np.exp(-way * (ALONG - 30.0))))
+    return path(LANES[0] + (LANES[1] - LANES[0]) / (1.0 + np.exp(30.0 - ALONG)))
 
 
 @pytest.fixture(scope="module")
