@@ -13,7 +13,8 @@ from ..progress import Progress, part, silent
 from ..strands import Strands
 from ..volume import BRICK, BrickVolume
 from ..volume.strand_signal import StrandProfile
-from .splat import CHUNK, blurred, render
+from .blur import CHUNK, blurred
+from .splat import render
 
 SCALES = (1.25, 2.5)
 """Voxel sizes of the comparison in units of the scan's (EVALUATION.md)."""

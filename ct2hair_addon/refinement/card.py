@@ -1,6 +1,6 @@
 """The fit's work on voxels on a graphics card, by torch: strands rendered, the misfit blurred, forces read from it.
 
-The same sums as `splat.py` and `motion.gather_forces`, in float32 and in no fixed order: results agree to rounding, not to the
+The same sums as `splat.py` and `forces.py`, in float32 and in no fixed order: results agree to rounding, not to the
 bit. Bricks lie on the card with a ring of empty ones around them, so that what is blurred across an edge is not lost, and a
 Gaussian along an axis is a product with a banded matrix.
 """
@@ -11,9 +11,12 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from ..progress import Progress, silent
+from ..progress import Progress, part, silent
 from ..volume import BRICK, BrickVolume
-from .splat import REACH, SAMPLES_PER_VOXEL, gaussian_taps, splat_taps
+from .blur import REACH, gaussian_taps
+from .curves import SAMPLES_PER_VOXEL
+from .forces import shares_seen
+from .splat import splat_taps
 
 SAMPLES = 1 << 22
 """Samples along strands that are worked on at a time: some 600 MB."""
@@ -56,8 +59,22 @@ class CardPotential:
             torch.zeros((self.empty + 1, BRICK, BRICK, BRICK), dtype=torch.float32, device=device) for _ in range(2)
         )
 
-    def update(self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, progress: Progress = silent) -> float:
-        """Take the potential of strands at `voxels` (M, 3); returns half the weighted square sum of the misfit."""
+    def forces(
+        self,
+        voxels: np.ndarray,
+        offsets: np.ndarray,
+        visible: np.ndarray,
+        forces: np.ndarray,
+        weights: np.ndarray,
+        progress: Progress = silent,
+    ) -> float:
+        """Write what is asked of each control point, and return half the weighted square sum of the misfit, as there."""
+        error = self._update(voxels, offsets, visible, part(progress, 0.0, 0.5))
+        self._gather(voxels, offsets, visible, forces, weights, part(progress, 0.5, 1.0))
+        return error
+
+    def _update(self, voxels, offsets, visible, progress: Progress) -> float:
+        """Take the potential of strands; half the weighted square sum of the misfit."""
         self.values.zero_()
         flat = self.values.view(-1)
         for done, samples in self._samples(voxels, offsets, visible):
@@ -81,24 +98,21 @@ class CardPotential:
         progress(1.0, 1.0)
         return float(error)
 
-    def forces(
-        self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, forces: np.ndarray, weights: np.ndarray
-    ) -> None:
-        """Write what the potential asks of each control point: forces (M, 3) and weights (M,), as `motion.gather_forces`."""
+    def _gather(self, voxels, offsets, visible, forces, weights, progress: Progress) -> None:
+        """Read forces and weights from the potential."""
         count = len(voxels)
         pull = torch.zeros((count, 3), dtype=torch.float32, device=self.device)
-        total, shown = (torch.zeros(count, dtype=torch.float32, device=self.device) for _ in range(2))
-        for _, samples in self._samples(voxels, offsets, visible):
+        shown = torch.zeros(count, dtype=torch.float32, device=self.device)
+        for done, samples in self._samples(voxels, offsets, visible):
+            progress(done, 1.0)
             slope = self._gradient(samples.middle)
             tangent = samples.tangent / samples.length.clamp_min(1e-12)[:, None]
             slope -= (slope * tangent).sum(1, keepdim=True) * tangent
             for point, weight in ((samples.first, 1.0 - samples.share), (samples.first + 1, samples.share)):
-                weight = weight * samples.length
-                total.index_add_(0, point, weight)
-                weight = weight * samples.seen
+                weight = weight * samples.length * samples.seen
                 shown.index_add_(0, point, weight)
                 pull.index_add_(0, point, weight[:, None] * slope, alpha=-1.0)
-        weights[:] = (shown / total.clamp_min(1e-9)).cpu().numpy()
+        shares_seen(voxels, offsets, visible, weights)
         forces[:] = (pull / shown.clamp_min(1e-9)[:, None]).cpu().numpy()
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype) -> torch.Tensor:

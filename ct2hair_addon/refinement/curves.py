@@ -6,7 +6,6 @@ import numba
 import numpy as np
 
 from ..strands import Strands, _resample, offsets_from_counts
-from .splat import cubic
 
 TURN_PER_SEGMENT = 0.6
 """Radians that one cubic segment may turn: it then stays within 0.3 % of the radius of an arc."""
@@ -18,6 +17,7 @@ TURN_PER_EDGE = 0.25
 LONGEST_EDGE = 8.0
 """mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
+SAMPLES_PER_VOXEL = 2.0
 SHARES = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
 """Of what its neighbours want each segment gets so much: edges then grow by degrees."""
 
@@ -109,13 +109,9 @@ def _evaluate_cubics(points, offsets, wanted, out_offsets, out):
                 m += 1
             t = min(max((place - wanted[m]) / (wanted[m + 1] - wanted[m]), 0.0), 1.0)
             at_start, at_end = m == start, m + 2 == end
-            p0 = m if at_start else m - 1
-            p3 = m + 1 if at_end else m + 2
-            a, b, c, d = cubic(t, at_start, at_end)
             for axis in range(3):
-                out[first + s, axis] = (
-                    a * points[p0, axis] + b * points[m, axis] + c * points[m + 1, axis] + d * points[p3, axis]
-                )
+                a, b, c = spline(points, m, at_start, at_end, axis)
+                out[first + s, axis] = points[m, axis] + t * (a + t * (b + t * c)) if t < 1.0 else points[m + 1, axis]
 
 
 @numba.njit(cache=True, parallel=True)
@@ -169,3 +165,22 @@ def _turning(points, offsets):
         for m in range(offsets[n] + 1, offsets[n + 1] - 1):
             turning[n] += _turn(points, m)
     return turning
+
+
+@numba.njit(cache=True, inline="always")
+def spline(points, m, first, last, axis):
+    """Along one axis, the Catmull-Rom cubic from control point m (at t = 0) to m + 1 (at t = 1) is `points[m] + t (a + t (b +
+    t c))`: (a, b, c). first, last: whether the strand ends there; the missing point is mirrored."""
+    p, q = points[m, axis], points[m + 1, axis]
+    before = 2.0 * p - q if first else points[m - 1, axis]
+    after = 2.0 * q - p if last else points[m + 2, axis]
+    return 0.5 * (q - before), before - 2.5 * p + 2.0 * q - 0.5 * after, 1.5 * (p - q) + 0.5 * (after - before)
+
+
+@numba.njit(cache=True, inline="always")
+def segment_samples(points, m):
+    """How many samples the segment from control point m to m + 1 gets."""
+    dx = points[m + 1, 0] - points[m, 0]
+    dy = points[m + 1, 1] - points[m, 1]
+    dz = points[m + 1, 2] - points[m, 2]
+    return max(1, int(np.ceil(SAMPLES_PER_VOXEL * np.sqrt(dx * dx + dy * dy + dz * dz))))

@@ -15,11 +15,14 @@ from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile
+from .binning import bin_segments
+from .blur import blurred
 from .boundary import Boundary
 from .curves import local_curvature, segment_lengths
 from .device import takes_card
-from .motion import gather_forces, keep_lengths, smooth_step
-from .splat import blurred, halved, misfit
+from .forces import gather_forces
+from .motion import keep_lengths, smooth_step
+from .splat import halved, misfit
 
 LEVEL_BLUR = 0.85
 """Blur of the coarser levels, voxels: as sharp as trilinear reading allows."""
@@ -115,8 +118,7 @@ def fit_to_volume(
             if iteration % PLANES_EVERY == 0:
                 visible = boundary.look(points)
             voxels = level.scan.to_voxel(points)
-            error = potential.update(voxels, offsets, visible, part(step, 0.0, 0.9))
-            potential.forces(voxels, offsets, visible, forces, weights)
+            error = potential.forces(voxels, offsets, visible, forces, weights, part(step, 0.0, 0.9))
             forces *= newton * size
             if iteration % BENDS_EVERY == 0:
                 bends = SMOOTH_TURN / np.maximum(local_curvature(points, offsets), 1e-6)
@@ -144,22 +146,26 @@ class Potential:
     """
 
     def __init__(self, scan: BrickVolume, blur: float, gain: float) -> None:
-        self.scan, self.blur, self.gain = scan, blur, gain
-        self.residual, self.values = (np.empty(scan.bricks.shape, np.float32) for _ in range(2))
-
-    def update(self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, progress: Progress = silent) -> float:
-        """Take the potential of strands at `voxels` (M, 3); returns half the weighted square sum of the misfit."""
-        scan = self.scan
-        error = misfit(voxels, offsets, visible, scan, self.blur, self.gain, self.residual, part(progress, 0.0, 0.67))
-        field = BrickVolume(scan.table, self.residual, scan.spacing, scan.origin)
-        blurred(field, self.blur, self.values, part(progress, 0.67, 1.0))
-        return error
+        self.blur, self.gain, self.scan = blur, gain, scan
+        self.residual = BrickVolume(scan.table, np.empty(scan.bricks.shape, np.float32), scan.spacing, scan.origin)
 
     def forces(
-        self, voxels: np.ndarray, offsets: np.ndarray, visible: np.ndarray, forces: np.ndarray, weights: np.ndarray
-    ) -> None:
-        """Write what the potential asks of each control point: forces (M, 3) and weights (M,), as `gather_forces`."""
-        gather_forces(voxels, offsets, visible, self.scan.table, self.values, forces, weights)
+        self,
+        voxels: np.ndarray,
+        offsets: np.ndarray,
+        visible: np.ndarray,
+        forces: np.ndarray,
+        weights: np.ndarray,
+        progress: Progress = silent,
+    ) -> float:
+        """Write what is asked of each control point of strands at `voxels` (M, 3): forces (M, 3) and weights (M,), as
+        `gather_forces`. Returns half the weighted square sum of the misfit."""
+        segments = bin_segments(voxels, offsets, visible, self.scan.table)
+        out, step = self.residual.bricks, part(progress, 0.0, 0.5)
+        error = misfit(voxels, visible, segments, self.scan, self.blur, self.gain, out, step)
+        step = part(progress, 0.5, 1.0)
+        gather_forces(voxels, offsets, visible, segments, self.residual, self.blur, forces, weights, step)
+        return error
 
 
 def _potentials(density: BrickVolume, device: str):

@@ -18,7 +18,9 @@ from ..progress import Progress, part, silent
 from ..volume import BrickVolume
 from ..volume.grid import trilinear, voxel
 from ..volume.strand_signal import INTERPOLATION_VARIANCE, StrandProfile, add_strand
-from .splat import CHUNK, blurred, cubic, render, segment_samples
+from .blur import CHUNK, blurred
+from .curves import segment_samples, spline
+from .splat import render
 
 LEAST_EARNED = 8.0
 """voxel; a strand that earns less than so much of a lone strand's length is left out."""
@@ -145,15 +147,16 @@ def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, e
     earned[0] = 0.0
     for m in range(start, end - 1):
         first, last = m == start, m + 2 >= end
-        p0 = m if first else m - 1
-        p3 = m + 1 if last else m + 2
+        ax, bx, cx = spline(points, m, first, last, 0)
+        ay, by, cy = spline(points, m, first, last, 1)
+        az, bz, cz = spline(points, m, first, last, 2)
         count = segment_samples(points, m)
         px, py, pz = points[m, 0], points[m, 1], points[m, 2]
         for s in range(count):
-            wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
-            qx = wa * points[p0, 0] + wb * points[m, 0] + wc * points[m + 1, 0] + wd * points[p3, 0]
-            qy = wa * points[p0, 1] + wb * points[m, 1] + wc * points[m + 1, 1] + wd * points[p3, 1]
-            qz = wa * points[p0, 2] + wb * points[m, 2] + wc * points[m + 1, 2] + wd * points[p3, 2]
+            t = (s + 1.0) / count
+            qx = points[m, 0] + t * (ax + t * (bx + t * cx))
+            qy = points[m, 1] + t * (ay + t * (by + t * cy))
+            qz = points[m, 2] + t * (az + t * (bz + t * cz))
             tx, ty, tz = qx - px, qy - py, qz - pz
             length = np.sqrt(tx * tx + ty * ty + tz * tz)
             t = (s + 0.5) / count
@@ -227,14 +230,12 @@ def take_out(table, excess, points, visible, start, end, low, high, peak, blur):
     at = 1
     for m in range(low, high):
         first, last = m == start, m + 2 >= end
-        p0 = m if first else m - 1
-        p3 = m + 1 if last else m + 2
         count = segment_samples(points, m)
         for s in range(count):
-            wa, wb, wc, wd = cubic((s + 1.0) / count, first, last)
-            for axis in range(3):
-                path[at, axis] = wa * points[p0, axis] + wb * points[m, axis] + wc * points[m + 1, axis] + wd * points[p3, axis]
             t = (s + 1.0) / count
+            for axis in range(3):
+                a, b, c = spline(points, m, first, last, axis)
+                path[at, axis] = points[m, axis] + t * (a + t * (b + t * c))
             amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
             at += 1
     add_strand(table, excess, path, amplitude, blur)

@@ -1,4 +1,5 @@
-"""Strands rendered into bricks: mass, peak, scipy's own blur; the misfit by hand, its slope by finite differences."""
+"""Strands rendered into bricks: mass, peak, scipy's own blur, bricks in any order; the misfit by hand, its slope by finite
+differences and a plain reading."""
 
 from __future__ import annotations
 
@@ -9,17 +10,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from ct2hair_addon.refinement.motion import gather_forces
-from ct2hair_addon.refinement.splat import (
-    SPLAT_VARIANCE,
-    _fit_bricks,
-    blurred,
-    gaussian_taps,
-    halved,
-    misfit,
-    render,
-    splat_taps,
-)
+from ct2hair_addon.refinement.binning import bin_segments
+from ct2hair_addon.refinement.blur import blurred, gaussian_taps
+from ct2hair_addon.refinement.forces import gather_forces
+from ct2hair_addon.refinement.splat import SPLAT_VARIANCE, _fit_bricks, halved, misfit, render, splat_taps
 from ct2hair_addon.volume import BrickVolume
 
 BLUR = 0.85
@@ -99,6 +93,26 @@ def test_bricks_that_are_not_there_get_nothing_and_the_others_the_same():
     assert not found[some == 0].any()
 
 
+def test_the_order_of_bricks_changes_no_bit():
+    points, offsets, visible = curves(7, 20)
+    volume = full()
+    plain = dense_of(volume, render(points, offsets, visible, volume, BLUR))
+    mixed = np.random.default_rng(7).permutation(volume.table.size).astype(np.int32).reshape(volume.table.shape)
+    shuffled = BrickVolume(mixed, volume.bricks, 1.0, np.zeros(3))
+    np.testing.assert_array_equal(dense_of(shuffled, render(points, offsets, visible, shuffled, BLUR)), plain)
+
+
+def test_hair_beside_the_table_spreads_into_it():
+    """A strand a voxel and a half off the volume's face leaves what a larger volume gets there."""
+    points = np.stack([np.full(9, -1.5), *np.tile(np.linspace(4, 40, 9), (2, 1))], axis=1)
+    offsets, visible = np.array([0, 9]), np.ones(9)
+    found = dense_of(full(), render(points, offsets, visible, full(), BLUR))
+    larger = full((80, 48, 48))
+    moved = dense_of(larger, render(points + [16.0, 0.0, 0.0], offsets, visible, larger, BLUR))
+    assert found[0].max() > 0.01
+    np.testing.assert_array_equal(found, moved[16:64])
+
+
 def test_threads_change_no_bit():
     points, offsets, visible = curves(3, 40)
     before = numba.get_num_threads()
@@ -144,11 +158,91 @@ def test_the_misfit_is_what_the_formula_says():
     target = BrickVolume.from_dense(np.random.default_rng(6).normal(0.1, 0.05, (48, 48, 48)).astype(np.float32), 1.0)
     gain = 0.7
     out = np.empty_like(target.bricks)
-    error = misfit(points, offsets, visible, target, BLUR, gain, out)
+    error = misfit(points, visible, bin_segments(points, offsets, visible, target.table), target, BLUR, gain, out)
     model = gain * render(points, offsets, visible, target, BLUR).astype(np.float64)
     weight = 1.0 / (1.0 + model / (gain / (2 * np.pi * BLUR**2)))
     np.testing.assert_allclose(out, weight * (model - target.bricks), atol=1e-5)
     assert error == pytest.approx(0.5 * (weight * (model - target.bricks) ** 2).sum(), rel=1e-4)
+
+
+def asked(points, offsets, visible, field, blur):
+    forces, weights = np.full_like(points, np.nan), np.full(len(points), np.nan)
+    segments = bin_segments(points, offsets, visible, field.table)
+    gather_forces(points, offsets, visible, segments, field, blur, forces, weights)
+    return forces, weights
+
+
+def holed(seed=0):
+    """Random values, smooth enough that where exactly they are read counts little, the middle brick left out."""
+    values = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(48, 48, 48)), 2.0).astype(np.float32)
+    values[16:32, 16:32, 16:32] = 0.0
+    return BrickVolume.from_dense(values, 1.0)
+
+
+def plain(points, visible, potential):
+    """Force on each control point of one strand, by fine sampling of the trilinear potential and differences in it."""
+    per = 400
+    line = catmull_rom(points, per)
+    tangent = np.gradient(line, axis=0)
+    length = np.linalg.norm(tangent, axis=1)
+    h = 1e-3
+    slope = np.stack(
+        [
+            (
+                ndimage.map_coordinates(potential, (line + h * e).T, order=1)
+                - ndimage.map_coordinates(potential, (line - h * e).T, order=1)
+            )
+            / (2 * h)
+            for e in np.eye(3)
+        ],
+        axis=1,
+    )
+    unit = tangent / length[:, None]
+    slope -= (slope * unit).sum(axis=1, keepdims=True) * unit
+    number, t = np.divmod(np.arange(len(line)) + 0.5, per)
+    number, t = number.astype(int), t / per
+    seen = (1 - t) * visible[number] + t * visible[number + 1]
+    forces, shown = np.zeros_like(points), np.zeros(len(points))
+    for to, weight in ((number, (1 - t) * length * seen), (number + 1, t * length * seen)):
+        np.add.at(forces, to, -weight[:, None] * slope)
+        np.add.at(shown, to, weight)
+    return forces / np.maximum(shown, 1e-9)[:, None]
+
+
+def test_forces_are_those_of_a_plain_reading_where_bricks_are_missing_too():
+    points, offsets, visible = curves(1, 3)
+    points = 24.0 + 1.1 * (points - 24.0)
+    visible[:5] = 0.0
+    visible[12:15] = 0.4
+    field = holed()
+    potential = blurred(field, 1.0)
+    dense = dense_of(field, potential).astype(float)
+    forces, weights = asked(points, offsets, visible, field, 1.0)
+    for n in range(3):
+        some = slice(offsets[n], offsets[n + 1])
+        expected = plain(points[some], visible[some], dense)
+        # two samples a voxel against a hundred
+        assert np.abs(forces[some] - expected).max() < 0.1 * np.abs(expected).max()
+    assert not forces[:4].any() and not weights[:4].any()  # nothing shows there
+    np.testing.assert_allclose(weights[20:26], 1.0)
+    assert weights[13] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_strands_far_outside_stay_and_threads_change_no_bit():
+    points, offsets, visible = curves(2, 30)
+    points[offsets[3] : offsets[4]] += 500.0
+    points[offsets[5] : offsets[6]] -= 500.0
+    field = holed(1)
+    forces, weights = asked(points, offsets, visible, field, BLUR)
+    for n in (3, 5):
+        assert not forces[offsets[n] : offsets[n + 1]].any()
+    np.testing.assert_allclose(weights, 1.0)
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        np.testing.assert_array_equal(asked(points, offsets, visible, field, BLUR)[0], forces)
+    finally:
+        numba.set_num_threads(before)
 
 
 @pytest.mark.parametrize("direction", [(0, 1, 0), (0.6, 0, 0.8)])
@@ -163,11 +257,13 @@ def test_forces_are_the_misfits_slope_by_finite_differences(direction):
     across = np.array(direction, float) - (direction @ along) * along
     across /= np.linalg.norm(across)
     points = truth + 0.7 * across
-    out, potential = np.empty_like(target.bricks), np.empty_like(target.bricks)
+    out = np.empty_like(target.bricks)
 
     def error(step):
+        moved = points + step * across
+        segments = bin_segments(moved, offsets, visible, target.table)
         # a peak that is never reached: all weights are 1
-        return _fit_bricks(points + step * across, offsets, visible, target, BLUR, gain, 1e12, out, lambda *_: None)
+        return _fit_bricks(moved, visible, segments, target, BLUR, gain, 1e12, out, lambda *_: None)
 
     slope = (error(0.1) - error(-0.1)) / 0.2
     error(0.0)
@@ -177,10 +273,11 @@ def test_forces_are_the_misfits_slope_by_finite_differences(direction):
     length[[0, -1]] = 2.0
 
     def from_forces(blur):
-        blurred(BrickVolume(target.table, out, 1.0, np.zeros(3)), blur, potential)
-        gather_forces(points, offsets, visible, target.table, potential, forces, weights)
+        segments = bin_segments(points, offsets, visible, target.table)
+        misfit = BrickVolume(target.table, out, 1.0, np.zeros(3))
+        gather_forces(points, offsets, visible, segments, misfit, blur, forces, weights)
         np.testing.assert_allclose(weights, 1.0)
-        assert np.abs(forces @ along).max() < 1e-6  # nothing along the strand
+        assert np.abs(forces @ along).max() < 1e-5  # nothing along the strand
         return -gain * (length * (forces @ across)).sum()
 
     # reading between voxels is part of the blur, as the splat is: then the force is the slope
