@@ -38,6 +38,8 @@ NEAREST = 8
 ROUNDS = 12
 CHUNK = 100_000
 """Places asked at once: what bounds memory."""
+BLOCK = 64
+"""Pairs weighed by one thread at a time."""
 
 
 def exchange_tips(
@@ -112,36 +114,36 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
 def _weigh(lines, following, previous, pairs, gain):
     """How much better two strands are with tips exchanged at each of `pairs`, whose second is moved to where it is nearest to
     the first; -1 where they can't be, and anything below LEAST_GAIN where that is not worth it."""
-    for n in numba.prange(len(pairs)):
-        one = pairs[n, 0]
-        other = _nearest(lines, one, pairs[n, 1], following, previous)
-        pairs[n, 1] = other
-        gain[n] = -1.0
-        heads, tails = (_walk(one, previous), _walk(other, previous)), (_walk(one, following), _walk(other, following))
-        if min(len(heads[0]), len(heads[1]), len(tails[0]), len(tails[1])) < HIDDEN + LEAST_SIDE:
-            continue
-        a, b = np.zeros(3), np.zeros(3)
-        for axis in range(3):
-            a[axis] = lines[tails[0][1], axis] - lines[heads[0][1], axis]
-            b[axis] = lines[tails[1][1], axis] - lines[heads[1][1], axis]
-        a, b = a / max(np.sqrt((a * a).sum()), 1e-9), b / max(np.sqrt((b * b).sum()), 1e-9)
-        parallel = (a * b).sum()
-        if parallel < PARALLEL:
-            continue
-        along = (a + b) / np.sqrt(2.0 + 2.0 * parallel)
-        side = np.zeros(3)
-        side[np.argmin(np.abs(along))] = 1.0
-        side -= (side * along).sum() * along
-        side /= np.sqrt((side * side).sum())
-        basis = np.stack((side, np.cross(along, side)))
-        stiff = min(_stiffness(lines, heads[0], tails[0]), _stiffness(lines, heads[1], tails[1]))
-        worth = _roughness(lines, heads[0], tails[0], basis, stiff) + _roughness(lines, heads[1], tails[1], basis, stiff)
-        # the roughness of what would be is not below 0: most places need no second look
-        if worth >= LEAST_GAIN:
-            worth -= _roughness(lines, heads[0], tails[1], basis, stiff)
-        if worth >= LEAST_GAIN:
-            worth -= _roughness(lines, heads[1], tails[0], basis, stiff)
-        gain[n] = worth
+    for block in numba.prange(-(-len(pairs) // BLOCK)):
+        walks, seen = np.empty((4, WINDOW), np.int64), np.empty((4, WINDOW, 2))
+        factor, known = np.empty((2 * WINDOW - 1, BAND + 1)), (0, 0, 0.0)
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, len(pairs))):
+            one = pairs[n, 0]
+            other = _nearest(lines, one, pairs[n, 1], following, previous)
+            pairs[n, 1] = other
+            gain[n] = -1.0
+            heads = _walk(one, previous, walks[0]), _walk(other, previous, walks[1])
+            tails = _walk(one, following, walks[2]), _walk(other, following, walks[3])
+            if min(heads[0], heads[1], tails[0], tails[1]) < HIDDEN + LEAST_SIDE:
+                continue
+            if not _across(lines, walks, (heads[0], heads[1], tails[0], tails[1]), seen):
+                continue
+            stiff = min(
+                _stiffness(lines, walks[0], walks[2], min(heads[0], tails[0]) - 1),
+                _stiffness(lines, walks[1], walks[3], min(heads[1], tails[1]) - 1),
+            )
+            known = _factor(heads[0], tails[0], stiff, factor, known)
+            worth = _roughness(seen[0], heads[0], seen[2], tails[0], factor)
+            known = _factor(heads[1], tails[1], stiff, factor, known)
+            worth += _roughness(seen[1], heads[1], seen[3], tails[1], factor)
+            # the roughness of what would be is not below 0: most places need no second look
+            if worth >= LEAST_GAIN:
+                known = _factor(heads[0], tails[1], stiff, factor, known)
+                worth -= _roughness(seen[0], heads[0], seen[3], tails[1], factor)
+            if worth >= LEAST_GAIN:
+                known = _factor(heads[1], tails[0], stiff, factor, known)
+                worth -= _roughness(seen[1], heads[1], seen[2], tails[0], factor)
+            gain[n] = worth
 
 
 @numba.njit(cache=True)
@@ -157,21 +159,50 @@ def _nearest(lines, one, other, following, previous):
 
 
 @numba.njit(cache=True)
-def _walk(start, onward):
-    """The points from `start` on, WINDOW at most: itself, then those that follow."""
-    found = np.empty(WINDOW, np.int64)
+def _walk(start, onward, found):
+    """Fill `found` with the points from `start` on, itself, then those that follow; returns how many there are."""
     count = 0
-    while start >= 0 and count < WINDOW:
+    while start >= 0 and count < len(found):
         found[count] = start
         start = onward[start]
         count += 1
-    return found[:count]
+    return count
 
 
 @numba.njit(cache=True)
-def _stiffness(lines, head, tail):
-    """What third differences weigh, voxel^6, on a curve that bends as a strand does, by three points of its window."""
-    span = min(len(head), len(tail)) - 1
+def _across(lines, walks, counts, seen):
+    """Fill `seen` with the points of `walks`, the heads of two strands and their tails, as they lie across the way of both,
+    voxels from the first's place; False where the two do not run one way."""
+    a, b = np.empty(3), np.empty(3)
+    for axis in range(3):
+        a[axis] = lines[walks[2, 1], axis] - lines[walks[0, 1], axis]
+        b[axis] = lines[walks[3, 1], axis] - lines[walks[1, 1], axis]
+    a /= max(np.sqrt((a * a).sum()), 1e-9)
+    b /= max(np.sqrt((b * b).sum()), 1e-9)
+    parallel = (a * b).sum()
+    if parallel < PARALLEL:
+        return False
+    a += b
+    a /= np.sqrt(2.0 + 2.0 * parallel)
+    b[:] = 0.0
+    b[np.argmin(np.abs(a))] = 1.0
+    b -= (b * a).sum() * a
+    b /= np.sqrt((b * b).sum())
+    ux, uy, uz = b[0], b[1], b[2]
+    vx, vy, vz = a[1] * uz - a[2] * uy, a[2] * ux - a[0] * uz, a[0] * uy - a[1] * ux
+    middle = walks[0, 0]
+    for which in range(4):
+        for m in range(counts[which]):
+            point = walks[which, m]
+            x, y, z = lines[point, 0] - lines[middle, 0], lines[point, 1] - lines[middle, 1], lines[point, 2] - lines[middle, 2]
+            seen[which, m, 0] = x * ux + y * uy + z * uz
+            seen[which, m, 1] = x * vx + y * vy + z * vz
+    return True
+
+
+@numba.njit(cache=True)
+def _stiffness(lines, head, tail, span):
+    """What third differences weigh, voxel^6, on a curve that bends as a strand does, by three points `span` steps apart."""
     square = 0.0
     for axis in range(3):
         square += (lines[head[span], axis] - 2.0 * lines[head[0], axis] + lines[tail[span], axis]) ** 2
@@ -179,42 +210,59 @@ def _stiffness(lines, head, tail):
 
 
 @numba.njit(cache=True)
-def _roughness(lines, head, tail, basis, stiff):
-    """What is left, voxel^2, of the misfit and change of bend of a smooth curve through a head, and a tail beyond its place."""
-    size = len(head) + len(tail) - 1
-    given, weight = np.empty((size, len(basis))), np.ones(size)
+def _factor(head, tail, stiff, factor, known):
+    """Fill the rows of `factor` with L D L' of what a smooth curve through a head, and a tail beyond its place, is the solution
+    of: 1 / D, then L one, two and three to the left. known: what it holds by now; returns what it holds then."""
+    if known == (head, tail, stiff):
+        return known
+    size = head + tail - 1
     for m in range(size):
-        point = lines[head[len(head) - 1 - m]] if m < len(head) else lines[tail[m - len(head) + 1]]
-        for axis in range(len(basis)):
-            given[m, axis] = (point * basis[axis]).sum()
-        if abs(m - len(head) + 1) <= HIDDEN:
-            weight[m] = 0.0
-    return _smooth_curve(given, weight, stiff, np.empty_like(given))
+        c1 = c2 = c3 = 0.0
+        whole = 1e-9 + (0.0 if abs(m - head + 1) <= HIDDEN else 1.0) + stiff * _thirds(m, 0, size)
+        if m >= 3:
+            c3 = stiff * _thirds(m, 3, size)
+        if m >= 2:
+            c2 = stiff * _thirds(m, 2, size) - c3 * factor[m - 2, 1]
+        if m >= 1:
+            c1 = stiff * _thirds(m, 1, size) - c3 * factor[m - 1, 2] - c2 * factor[m - 1, 1]
+        for k, c in ((1, c1), (2, c2), (3, c3)):
+            factor[m, k] = 0.0
+            if m >= k:
+                factor[m, k] = c * factor[m - k, 0]
+                whole -= c * factor[m, k]
+        factor[m, 0] = 1.0 / whole
+    return head, tail, stiff
 
 
 @numba.njit(cache=True)
-def _smooth_curve(given, weight, stiff, curve):
-    """Fill `curve` (n, c) with the least of sum weight |curve - given|^2 + stiff |third difference|^2, and return that."""
-    size, axes = given.shape
-    band = np.zeros((size, BAND + 1))
-    for i in range(size):
-        band[i, 0] = weight[i] + 1e-9
-        for axis in range(axes):
-            curve[i, axis] = weight[i] * given[i, axis]
-    for i in range(size - BAND):
-        for p in range(BAND + 1):
-            for q in range(p, BAND + 1):
-                band[i + p, q - p] += stiff * third(p) * third(q)
-    solve_bands(band, curve)
+def _thirds(m, k, size):
+    """How third differences of `size` points couple the m-th with the one k before."""
     total = 0.0
-    for axis in range(axes):
-        for i in range(size):
-            total += weight[i] * (curve[i, axis] - given[i, axis]) ** 2
-        for i in range(size - BAND):
-            change = 0.0
-            for p in range(BAND + 1):
-                change += third(p) * curve[i + p, axis]
-            total += stiff * change**2
+    for i in range(max(m - BAND, 0), min(m - k, size - BAND - 1) + 1):
+        total += third(m - i) * third(m - k - i)
+    return total
+
+
+@numba.njit(cache=True)
+def _roughness(head, heads, tail, tails, factor):
+    """What is left, voxel^2, of the misfit and change of bend of a smooth curve through a head, and a tail beyond its place.
+
+    It is g' W g - g' W c, where the curve c solves A c = W g, A = W + K: with A = L D L' and y = L^-1 W g, g' W g - y' D^-1 y.
+    """
+    total = 0.0
+    u1 = u2 = u3 = v1 = v2 = v3 = 0.0
+    for m in range(heads + tails - 1):
+        u = v = 0.0
+        if abs(m - heads + 1) > HIDDEN:
+            if m < heads:
+                u, v = head[heads - 1 - m, 0], head[heads - 1 - m, 1]
+            else:
+                u, v = tail[m - heads + 1, 0], tail[m - heads + 1, 1]
+            total += u * u + v * v
+        u -= factor[m, 1] * u1 + factor[m, 2] * u2 + factor[m, 3] * u3
+        v -= factor[m, 1] * v1 + factor[m, 2] * v2 + factor[m, 3] * v3
+        total -= (u * u + v * v) * factor[m, 0]
+        u1, u2, u3, v1, v2, v3 = u, u1, u2, v, v1, v2
     return total
 
 
@@ -222,7 +270,7 @@ def _smooth_curve(given, weight, stiff, curve):
 def _exchange(lines, following, previous, owner, pairs, touched):
     """Exchange the tips of strands at `pairs`, best first, where nothing was `touched` (K,) bool yet: (how many, (J,) bool:
     those that were, to be weighed anew). The points of both by the place are laid on the curve that now goes through."""
-    done, waits = 0, np.zeros(len(pairs), np.bool_)
+    done, waits, walks = 0, np.zeros(len(pairs), np.bool_), np.empty((2, WINDOW), np.int64)
     for n in range(len(pairs)):
         one, other = pairs[n]
         if touched[one] or touched[other]:
@@ -242,7 +290,8 @@ def _exchange(lines, following, previous, owner, pairs, touched):
             owner[beyond] = first
             beyond = following[beyond]
         for place in (one, other):
-            head, tail = _walk(place, previous), _walk(following[place], following)
+            head = walks[0][: _walk(place, previous, walks[0])]
+            tail = walks[1][: _walk(following[place], following, walks[1])]
             _mend(lines, head, tail)
             touched[head] = True
             touched[tail] = True
@@ -253,15 +302,20 @@ def _exchange(lines, following, previous, owner, pairs, touched):
 def _mend(lines, head, tail):
     """Lay the points up to HIDDEN from a head's first and a tail's first point on a smooth curve through the others."""
     size = len(head) + len(tail)
-    given, weight, curve = np.empty((size, 3)), np.ones(size), np.empty((size, 3))
+    curve, band = np.empty((size, 3)), np.zeros((size, BAND + 1))
+    stiff = _stiffness(lines, head, tail, min(len(head), len(tail)) - 1)
     index = np.concatenate((head[::-1], tail))
+    hidden = np.zeros(size, np.bool_)
     for m in range(size):
-        given[m] = lines[index[m]]
-        if -HIDDEN <= m - len(head) + 1 <= HIDDEN + 1:
-            weight[m] = 0.0
-    _smooth_curve(given, weight, _stiffness(lines, head, tail), curve)
+        hidden[m] = -HIDDEN <= m - len(head) + 1 <= HIDDEN + 1
+        weight = 0.0 if hidden[m] else 1.0
+        for k in range(min(BAND, size - 1 - m) + 1):
+            band[m, k] = stiff * _thirds(m + k, k, size)
+        band[m, 0] += weight + 1e-9
+        curve[m] = weight * lines[index[m]]
+    solve_bands(band, curve)
     for m in range(size):
-        if weight[m] == 0.0:
+        if hidden[m]:
             lines[index[m]] = curve[m]
 
 
