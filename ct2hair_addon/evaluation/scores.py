@@ -170,7 +170,7 @@ def head_scores(result: Strands, head: HeadMesh, queries: int = QUERIES) -> dict
         return {"roots_on_scalp": 0.0, "inside_head": 0.0}
     on_scalp = surface.closest_scalp(strands.roots).distance <= ROOT_REACH
     points = sample_curves(strands.select(_drawn(_millimetres(strands), queries)), 2.0 * TARGET_STEP).points
-    depth = surface.signed_distance(points)
+    depth = surface.signed_distance(points, INSIDE)
     return {"roots_on_scalp": float(on_scalp.mean()), "inside_head": float((depth < -INSIDE).mean())}
 
 

@@ -36,7 +36,7 @@ LEAST_TIED = 0.3
 def by_the_scalp(knots: np.ndarray, head: Head) -> np.ndarray:
     """Those of `knots` (K, 3) mm that lie on the scalp: what is farther off is no knot."""
     knots = np.asarray(knots, np.float64).reshape(-1, 3)
-    return knots[np.abs(head.signed_distance(knots)) < HEIGHT] if len(knots) else knots
+    return knots[np.abs(head.signed_distance(knots, HEIGHT)) < HEIGHT] if len(knots) else knots
 
 
 def strands_by_knots(knots: np.ndarray | None, head: Head, spacing: float) -> tuple[int, bool]:

@@ -99,7 +99,7 @@ def push_out(strands: Strands, head: Head) -> tuple[Strands, int]:
     points = strands.points.astype(np.float64)
     first = np.zeros(len(points), bool)
     first[strands.offsets[:-1]] = True
-    depth = head.signed_distance(points)
+    depth = head.signed_distance(points, CLEARANCE)
     moved = np.flatnonzero((depth < CLEARANCE) & ~first)
     total = len(moved)
     for _ in range(4):

@@ -55,7 +55,7 @@ def shown_lengths(strands: Strands, head, floor: float) -> np.ndarray:
     if floor <= 0.0:
         return lengths
     steps = strands.resampled_by_step(max(0.25 * floor, 0.5))
-    outside = (np.asarray(head.signed_distance(steps.points)) >= floor).astype(np.float64)
+    outside = (np.asarray(head.signed_distance(steps.points, floor)) >= floor).astype(np.float64)
     # a step counts by its two ends: without that, the root alone would take half a step from every strand
     ends = 0.5 * (outside[steps.offsets[:-1]] + outside[steps.offsets[1:] - 1])
     share = (np.bincount(steps.strand_index, outside, len(steps)) - ends) / np.maximum(steps.counts - 1, 1)

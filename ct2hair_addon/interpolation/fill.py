@@ -266,7 +266,7 @@ def _outside(strands: np.ndarray, head, progress: Progress) -> tuple[np.ndarray,
             progress(attempt + start / max(len(rows), 1), PUSHES)
             some = rows[start : start + CHUNK]
             points = strands[some, 1:]
-            distance = np.asarray(head.signed_distance(points.reshape(-1, 3).astype(np.float32)), np.float64)
+            distance = np.asarray(head.signed_distance(points.reshape(-1, 3).astype(np.float32), CLEARANCE), np.float64)
             distance = distance.reshape(points.shape[:2])
             # The root lies on the surface: its neighbours are given a few points to rise.
             rise = CLEARANCE * np.minimum(np.arange(1, points.shape[1] + 1) / 4.0, 1.0)

@@ -17,8 +17,9 @@ LAST_PUSHES = 6
 class Boundary:
     """The head's tangent planes near strands, taken anew by `look`; `push` moves points out of them.
 
-    head answers `signed_distance(points (M, 3) float32) -> (M,)`, mm, negative inside. floor: distance from the head, mm,
-    below which the scan shows no hair (net cut away). ramp: mm over which strands fade in above it, a voxel of the scan.
+    head answers `signed_distance(points (M, 3) float32, beyond) -> (M,)` as `Head` does, mm, negative inside. floor: distance
+    from the head, mm, below which the scan shows no hair (net cut away). ramp: mm over which strands fade in above it, a voxel
+    of the scan.
     """
 
     def __init__(self, head, floor: float, ramp: float) -> None:
@@ -37,7 +38,8 @@ class Boundary:
             # The distance changes no faster than a point moves: far points need no second look until they may be near.
             moved = np.linalg.norm(points - self._seen_at, axis=1)
             stale = self._distance - moved < NEAR
-        self._distance[stale] = self.head.signed_distance(points[stale].astype(np.float32))
+        told = max(NEAR, self.floor + self.ramp)
+        self._distance[stale] = self.head.signed_distance(points[stale].astype(np.float32), told)
         self._seen_at[stale] = points[stale]
         self.near = self._distance < NEAR
         self.plane = np.zeros((len(points), 4))
@@ -61,7 +63,7 @@ class Boundary:
         rows = np.flatnonzero(~root)
         found = 0
         for attempt in range(LAST_PUSHES):
-            distance = np.asarray(self.head.signed_distance(points[rows].astype(np.float32)), np.float64)
+            distance = np.asarray(self.head.signed_distance(points[rows].astype(np.float32), MARGIN), np.float64)
             inside = distance < 0.5 * MARGIN
             rows, distance = rows[inside], distance[inside]
             found = found or len(rows)

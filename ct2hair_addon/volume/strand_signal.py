@@ -186,7 +186,7 @@ def data_floor(density: BrickVolume, hair_level: float, head, sample: int = 200_
     if total == 0:
         return 0.0
     centres = density.to_scan(16.0 * density.brick_index + 7.5)
-    reach = head.signed_distance(centres.astype(np.float32))
+    reach = head.signed_distance(centres.astype(np.float32), 16.0 * density.spacing)
     near = np.flatnonzero((per_brick > 0) & (reach < 16.0 * density.spacing))
     if not len(near):
         return 0.0

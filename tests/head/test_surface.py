@@ -43,6 +43,17 @@ def test_the_signed_distance_is_the_trees_and_the_winding_numbers(template_queri
     np.testing.assert_allclose(template_queries.signed_distance(points), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("beyond", [0.05, 4.0, 30.0])
+def test_beyond_what_is_asked_a_bound_of_the_distance_is_told(template_queries, beyond):
+    points = np.random.default_rng(3).uniform(-200, 400, (4000, 3)) + template_queries.mesh.vertices.mean(axis=0) - 100.0
+    exact, told = template_queries.signed_distance(points), template_queries.signed_distance(points, beyond)
+    near = np.abs(exact) <= beyond
+    np.testing.assert_array_equal(told[near], exact[near])
+    assert (np.sign(told) == np.sign(exact)).all()
+    assert (np.abs(told[~near]) >= beyond - 1e-4).all() and (np.abs(told) <= np.abs(exact) + 1e-4).all()
+    assert (told != exact).any()
+
+
 def test_threads_change_no_bit(template_queries, points):
     before = numba.get_num_threads()
     many = template_queries.signed_distance(points), template_queries.closest_scalp(points).position
