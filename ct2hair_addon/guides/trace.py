@@ -18,7 +18,7 @@ from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, add_strand
-from .sampling import centred, course_at, density_at, line_mean, plane
+from .sampling import PATCH, centred, course_at, density_at, density_near, line_mean, patch_around, plane
 
 MOST_STEPS = 3000
 """Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
@@ -26,6 +26,9 @@ BATCH = 1024
 """Seeds followed at once: few enough that two of them seldom meet the same strand, many enough for any number of threads."""
 LOOK = 10
 """voxel; how far ahead the density is summed."""
+HALFWAY, SPARE = 8, 2
+"""voxel; how far ahead the middle of the patch lies in which the density is read, and what it should hold around a path's end
+and the look-ahead's."""
 RINGS = ((0.12, 6), (0.26, 8), (0.45, 10))
 """Directions tried around the present one: (tangent of the angle, how many)."""
 TURN_COST = 0.8
@@ -50,8 +53,11 @@ WIDENINGS, WIDEST = 2, 0.25
 """How often that is done, since neighbours make it look less; and how far a path is moved out each time at most, voxel."""
 SUPPORT = 0.4
 """Share of a lone strand's density, averaged over the look-ahead, below which a path ends."""
-SHARPNESS = 0.06
-"""Share of a strand's density by which one direction must beat another to count e times as much."""
+SHARPNESS, ASIDE = 0.06, 4.0
+"""Share of a strand's density by which one direction must beat another to count e times as much, and how many times that it
+may be behind to count at all."""
+MOST = 1.3
+"""What a place counts at most, lone strands' densities: no hair is followed for its neighbours' sake."""
 
 
 class End(IntEnum):
@@ -88,16 +94,26 @@ WEIGHTS = np.linspace(1.0, 0.4, LOOK)
 """Weights of the look-ahead's samples: what is near says more, since hair curves."""
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _held(patch, x, y, z):
+    """Whether a patch holds a point and a few voxels around it."""
+    low, high = SPARE, PATCH - 1 - SPARE
+    return low <= x - patch[1] <= high and low <= y - patch[2] <= high and low <= z - patch[3] <= high
+
+
 @numba.njit(cache=True, nogil=True)
 def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
     """Follow one way from (x, y, z) along d into `path` (n, 3) voxels; returns (points, reason)."""
-    whole = weights.sum()
+    whole, strands = weights.sum(), 1.0 / seen
     count = 0
     start_x, start_y, start_z = x, y, z
     scores = np.empty(len(fan))
+    patch = patch_around(table, bricks, x + HALFWAY * dx, y + HALFWAY * dy, z + HALFWAY * dz, np.empty(PATCH**3, np.float32))
     while True:
         if count == len(path):
             return count, End.LONG
+        if not (_held(patch, x, y, z) and _held(patch, x + LOOK * dx, y + LOOK * dy, z + LOOK * dz)):
+            patch = patch_around(table, bricks, x + HALFWAY * dx, y + HALFWAY * dy, z + HALFWAY * dz, patch[0])
         ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
         # Hair goes on bending as it did: the look-ahead bends along, or in a curl it would see the neighbours.
         bx = by = bz = 0.0
@@ -120,16 +136,19 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
             square = 1.0 + a * a + b * b
             norm = 1.0 / np.sqrt(square)
             ex, ey, ez = ex * norm, ey * norm, ez * norm
-            total = 0.0
-            for k in range(len(weights)):
+            cost = TURN_COST * (square - 1.0) + off * (1.0 - (ex * cx + ey * cy + ez * cz) ** 2)
+            # from afar, where directions part: most are soon known not to come near the best, whatever lies between
+            total, left, wanted = 0.0, MOST * whole, (best - ASIDE * SHARPNESS + cost) * whole
+            for k in range(len(weights) - 1, -1, -1):
                 far, bent = k + 1.0, 0.5 * (k + 1.0) ** 2
                 px, py, pz = x + far * ex + bent * bx, y + far * ey + bent * by, z + far * ez + bent * bz
-                value = density_at(table, bricks, px, py, pz) / seen
-                total += weights[k] * min(value, 1.3)
-            total /= whole
-            scores[n] = total - TURN_COST * (square - 1.0) - off * (1.0 - (ex * cx + ey * cy + ez * cz) ** 2)
+                total += weights[k] * min(density_near(table, bricks, patch, px, py, pz) * strands, MOST)
+                left -= weights[k] * MOST
+                if total + left < wanted:
+                    break
+            scores[n] = (total + left) / whole - cost
             if scores[n] > best:
-                best, chosen, backed = scores[n], n, total
+                best, chosen, backed = scores[n], n, total / whole
         if backed < SUPPORT:
             # The look-ahead sees the end before it is there: the last stretch, straight on.
             for _ in range(len(weights) // 2):
@@ -143,7 +162,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         a = b = weight = 0.0
         for n in range(len(fan)):
             if (
-                scores[n] > best - 4.0 * SHARPNESS
+                scores[n] > best - ASIDE * SHARPNESS
                 and (fan[n, 0] - fan[chosen, 0]) ** 2 + (fan[n, 1] - fan[chosen, 1]) ** 2 < 0.12
             ):
                 w = np.exp((scores[n] - best) / SHARPNESS)
@@ -152,7 +171,9 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
-        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step)
+        qx, qy, qz, _value = centred(
+            table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step, patch
+        )
         # Inertia: the new direction leans on the last few steps' secant.
         if count >= 4:
             sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]
@@ -250,8 +271,8 @@ def _widened(table, bricks, path, step, seen, blur):
         bent = max(np.sqrt(square), 1e-12)
         x, y, z = float(path[m, 0]), float(path[m, 1]), float(path[m, 2])
         u, v, w = (BESIDE / bent) * inward[m, 0], (BESIDE / bent) * inward[m, 1], (BESIDE / bent) * inward[m, 2]
-        inner[m + 1] = inner[m] + min(density_at(table, bricks, x + u, y + v, z + w) / seen, 1.3)
-        outer[m + 1] = outer[m] + min(density_at(table, bricks, x - u, y - v, z - w) / seen, 1.3)
+        inner[m + 1] = inner[m] + min(density_at(table, bricks, x + u, y + v, z + w) / seen, MOST)
+        outer[m + 1] = outer[m] + min(density_at(table, bricks, x - u, y - v, z - w) / seen, MOST)
         for axis in range(3):
             inward[m, axis] *= max(1.0 - (noise / bent) ** 2, 0.0) / bent
     for m in range(size):
@@ -330,7 +351,7 @@ def _settle(table, bricks, paths, firsts, counts, ends, seen, peak, blur, shorte
         values = np.empty(size)
         for m in range(size):
             p = paths[n, low + m]
-            values[m] = min(density_at(table, bricks, float(p[0]), float(p[1]), float(p[2])) / seen, 1.3)
+            values[m] = min(density_at(table, bricks, float(p[0]), float(p[1]), float(p[2])) / seen, MOST)
         backed = np.empty(size)
         for m in range(size):
             total, many = 0.0, 0
