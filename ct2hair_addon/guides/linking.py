@@ -251,7 +251,7 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     cost = np.empty(len(one))
     _weigh(
         one, other, place, out, bend, place, out, bend, density.table, density.bricks, density.origin / voxel,
-        np.float32(strand), cost,
+        np.float32(strand), LOOSE_END, cost,
     )  # fmt: skip
     kept = cost < LOOSE_END
     one, other = one[kept], other[kept]
@@ -362,7 +362,7 @@ def _candidates(
             cost = np.empty(len(tip))
             _weigh(
                 tip, root, place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
-                density.origin / voxel, np.float32(strand), cost,
+                density.origin / voxel, np.float32(strand), dearest - PER_CUT * (cut + root_cut), cost,
             )  # fmt: skip
             cost += PER_CUT * (cut + root_cut)
             kept = cost < dearest
@@ -401,15 +401,16 @@ def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: fl
     some = np.empty(int(both.sum()))
     _weigh(
         tip[both], root[both], place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
-        density.origin / voxel, np.float32(strand), some,
+        density.origin / voxel, np.float32(strand), np.inf, some,
     )  # fmt: skip
     cost[both] = np.clip(some - PER_VOXEL * 2.0 * ACROSS, 0.0, 0.9 * LOOSE_END)
     return tip * len(lines) + root, np.zeros((len(tip), 2), np.int16), cost
 
 
 @numba.njit(cache=True, parallel=True)
-def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, cost):
-    """The cost of each joint (see the constants): the two courses, extended to the middle of the gap, must meet."""
+def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, most, cost):
+    """The cost of each joint (see the constants): the two courses, extended to the middle of the gap, must meet. Of one dearer
+    than `most` no more than that is told."""
     for n in numba.prange(len(tip)):
         a, b = tip[n], root[n]
         gap = 0.0
@@ -445,7 +446,10 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
         jump = 0.0
         for axis in range(3):
             jump += (bend[a, axis] - root_bend[b, axis]) ** 2
-        best += jump / (BEND[0] + BEND[1] * gap) ** 2
+        best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
+        if best > most:
+            cost[n] = best
+            continue
         backed = 0.0
         many = int(gap) + 1
         for m in range(many):
@@ -456,7 +460,7 @@ def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, 
             y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
             z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
             backed += min(max(density_at(table, bricks, x, y, z) / strand, 0.0), 1.0)
-        cost[n] = best + PER_VOXEL * gap + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
+        cost[n] = best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 
 def _assigned(count: int, joints: _Joints, prices: tuple[float, ...], known: int) -> tuple[np.ndarray, np.ndarray, float]:
