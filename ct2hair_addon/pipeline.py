@@ -282,7 +282,7 @@ class _Job:
         traced = guides.strands.with_attributes(guide=np.ones(len(guides.strands), bool))
         profile = lone_profile(density, level, traced, lone, part(progress, 0.0, 0.05))
         device, step = settings.run.device, part(progress, 0.05, 0.6)
-        fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone)
+        fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone, final=False)
         if not len(fitted.strands):
             return guides
         pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))

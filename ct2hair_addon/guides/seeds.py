@@ -10,7 +10,7 @@ import numpy as np
 from ..progress import Progress, silent
 from ..volume.grid import BRICK, BrickVolume
 from ..volume.strand_signal import StrandProfile
-from .sampling import centred, density_at, plane
+from .sampling import centred, density_at, line_mean, plane
 
 SEED_SHARE = 8
 """One hair voxel in so many is a seed: several a strand's cross-section and centimetre, far more than strands need."""
@@ -20,6 +20,8 @@ RING = 2.6
 """voxel; the ring around a seed that tells a lone strand from a bundle: three times the usual blur."""
 AROUND = RING * np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1)
 """(6, 2): the points on it."""
+LEAST, FAINT = 0.5, 0.15
+"""Shares of a strand's density that a seed's line must have: at its peak, and where it lies, or the peak is not looked for."""
 CHUNK = 65536
 """Seeds weighed in one call: a fraction of a second."""
 REACH = 5
@@ -112,15 +114,16 @@ def _certainty(table, bricks, voxels, directions, seen, certainty):
         dx, dy, dz = float(directions[n, 0]), float(directions[n, 1]), float(directions[n, 2])
         norm = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
         dx, dy, dz = dx * norm, dy * norm, dz * norm
-        x, y, z, _value = centred(
-            table, bricks, float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2]), dx, dy, dz, 2, 1.0
-        )
+        x, y, z = float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2])
+        if line_mean(table, bricks, x, y, z, dx, dy, dz, 2) <= FAINT * seen:
+            continue
+        x, y, z, _value = centred(table, bricks, x, y, z, dx, dy, dz, 2, 1.0)
         ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
         middle = ring = 0.0
         for k in range(-REACH, REACH + 1, 2):
             middle += density_at(table, bricks, x + k * dx, y + k * dy, z + k * dz)
         middle /= REACH + 1
-        if middle <= 0.5 * seen:
+        if middle <= LEAST * seen:
             continue
         for k in range(-REACH, REACH + 1, 2):
             px, py, pz = x + k * dx, y + k * dy, z + k * dz

@@ -22,8 +22,13 @@ from .sampling import PATCH, centred, course_at, density_at, density_near, line_
 
 MOST_STEPS = 3000
 """Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
-BATCH = 1024
+BATCH = 256
 """Seeds followed at once: few enough that two of them seldom meet the same strand, many enough for any number of threads."""
+WINDOW = 32
+"""Times as many seeds are looked at for those at most."""
+ALIVE, FAINT = 0.55, 0.2
+"""Shares of a strand's density that must be left along a seed's line for it to be followed: at its peak, and where it lies, or
+the peak is not looked for."""
 LOOK = 10
 """voxel; how far ahead the density is summed."""
 HALFWAY, SPARE = 8, 2
@@ -286,16 +291,17 @@ def _widened(table, bricks, path, step, seen, blur):
 
 
 @numba.njit(cache=True, parallel=True)
-def _alive(table, bricks, voxels, directions, level):
+def _alive(table, bricks, voxels, directions, seen):
+    """(S,) bool: the seeds that still have a strand."""
     alive = np.zeros(len(voxels), np.bool_)
     for n in numba.prange(len(voxels)):
         dx, dy, dz = float(directions[n, 0]), float(directions[n, 1]), float(directions[n, 2])
         norm = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
         dx, dy, dz = dx * norm, dy * norm, dz * norm
-        x, y, z, _value = centred(
-            table, bricks, float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2]), dx, dy, dz, 2, 0.8
-        )
-        alive[n] = line_mean(table, bricks, x, y, z, dx, dy, dz, 4) > level
+        x, y, z = float(voxels[n, 0]), float(voxels[n, 1]), float(voxels[n, 2])
+        if line_mean(table, bricks, x, y, z, dx, dy, dz, 4) > FAINT * seen:
+            x, y, z, _value = centred(table, bricks, x, y, z, dx, dy, dz, 2, 0.8)
+            alive[n] = line_mean(table, bricks, x, y, z, dx, dy, dz, 4) > ALIVE * seen
     return alive
 
 
@@ -412,11 +418,12 @@ def trace_segments(
     tally = {"seeds": len(order), "seeds already taken": 0, "paths too short or already taken": 0}
     tally |= dict.fromkeys(END_NAMES.values(), 0)
     paths = np.empty((BATCH, 2 * MOST_STEPS + 1, 3), np.float32)
-    at = 0
+    at, share = 0, 1.0
     progress(0, len(order))
     while at < len(order):
-        window = order[at : at + 32 * BATCH]
-        alive = np.flatnonzero(_alive(residual.table, residual.bricks, voxels[window], directions[window], 0.55 * profile.seen))
+        window = order[at : at + int(BATCH * min(1.5 / max(share, 1e-3), WINDOW))]
+        alive = np.flatnonzero(_alive(residual.table, residual.bricks, voxels[window], directions[window], profile.seen))
+        share = len(alive) / len(window)
         if len(alive) > BATCH:
             used, alive = int(alive[BATCH]), alive[:BATCH]
         else:

@@ -60,14 +60,16 @@ def refine(
     profile: StrandProfile | None = None,
     device: str = "auto",
     peak: float = 0.0,
+    final: bool = True,
 ) -> Refined:
     """Fit strands to the scan that they came from: roots stay where they are, curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
     measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where none runs alone.
-    device: auto, cpu or cuda (see `device.py`). The same input and seed give the same bits on any number of threads; a
-    graphics card rounds differently. Raises Cancelled (by progress) and CT2HairError (cuda asked for, none there).
+    device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: none goes after the fit, and
+    there are no scores. The same input and seed give the same bits on any number of threads; a graphics card rounds
+    differently. Raises Cancelled (by progress) and CT2HairError (cuda asked for, none there).
     """
     settings = settings or RefinementSettings()
     progress(0.0, 1.0)
@@ -96,7 +98,7 @@ def refine(
             points, offsets, density, hair_level, profile, boundary, settings, seed, device, step, traced
         )
         tally |= counts
-        if judged:
+        if judged and final:
             points, offsets, kept, counts = _pruned(
                 points,
                 offsets,
@@ -109,14 +111,17 @@ def refine(
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
     fitted = (Strands(points, offsets), boundary.look(points))
-    before, after = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
+    scores = {}
+    if final:
+        each = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
+        scores = dict(zip(("before", "after"), each, strict=True))
     fine, fine_offsets = polylines(points, offsets)
     fine[fine_offsets[:-1]] = kept.roots
     cleared, inside = boundary.clear(fine, fine_offsets)
     tally["points pushed out of the head at the end"] = int(inside)
     result = _supported(Strands(cleared, fine_offsets, kept.strand_attributes), density, hair_level)
     progress(1.0, 1.0)
-    return Refined(result, tally, {"before": before, "after": after})
+    return Refined(result, tally, scores)
 
 
 def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):

@@ -163,6 +163,14 @@ def test_without_iterations_strands_stay_but_for_their_points(fitted, head, prof
     assert result.scores["before"] == result.scores["after"]
 
 
+def test_strands_that_are_worked_on_are_fitted_alike_but_not_judged(fitted, head, profile):
+    _, given, result, density = fitted["straight"]
+    found = refine(given, density, LEVEL, head, profile=profile, final=False)
+    np.testing.assert_array_equal(found.strands.points, result.strands.points)
+    assert found.scores == {} and not any("after fitting" in name for name in found.tally)
+    assert result.scores and any("after fitting" in name for name in result.tally)
+
+
 def test_bad_strands_are_dropped_and_counted_and_an_empty_scan_moves_nothing(fitted, head, profile):
     _, given, _, density = fitted["straight"]
     points = given.points.copy()
