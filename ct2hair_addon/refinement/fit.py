@@ -13,16 +13,16 @@ import numpy as np
 
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
-from ..volume import BrickVolume
+from ..volume import BRICK, BrickVolume
 from ..volume.strand_signal import StrandProfile
-from .binning import bin_segments
+from .binning import RIM, bin_segments
 from .blur import blurred
 from .boundary import Boundary
 from .curves import local_curvature, segment_lengths
 from .device import takes_card
 from .forces import gather_forces
 from .motion import keep_lengths, smooth_step
-from .splat import halved, misfit
+from .splat import halved, misfit, ring
 
 LEVEL_BLUR = 0.85
 """Blur of the coarser levels, voxels: as sharp as trilinear reading allows."""
@@ -147,7 +147,11 @@ class Potential:
 
     def __init__(self, scan: BrickVolume, blur: float, gain: float) -> None:
         self.blur, self.gain, self.scan = blur, gain, scan
-        self.residual = BrickVolume(scan.table, np.empty(scan.bricks.shape, np.float32), scan.spacing, scan.origin)
+        self.places = np.full(np.add(scan.table.shape, 2 * RIM), -1, np.int32)
+        index = scan.brick_index + np.int32(RIM)
+        _, _, self.place, room = ring(index, len(self.places))
+        self.places[tuple(index.T)] = self.place
+        self.misfit = np.empty((room, BRICK, BRICK, BRICK), np.float32)
 
     def forces(
         self,
@@ -160,12 +164,12 @@ class Potential:
     ) -> float:
         """Write what is asked of each control point of strands at `voxels` (M, 3): forces (M, 3) and weights (M,), as
         `gather_forces`. Returns half the weighted square sum of the misfit."""
-        segments = bin_segments(voxels, offsets, visible, self.scan.table)
-        out, step = self.residual.bricks, part(progress, 0.0, 0.5)
-        error = misfit(voxels, visible, segments, self.scan, self.blur, self.gain, out, step)
-        step = part(progress, 0.5, 1.0)
-        gather_forces(voxels, offsets, visible, segments, self.residual, self.blur, forces, weights, step)
-        return error
+        segments, errors = bin_segments(voxels, offsets, visible, self.scan.table), np.empty(len(self.place))
+        layers = misfit(
+            voxels, visible, segments, self.scan, self.blur, self.gain, self.misfit, self.place, errors, progress
+        )  # fmt: skip
+        gather_forces(voxels, offsets, visible, segments, self.misfit, self.places, layers, self.blur, forces, weights)
+        return float(errors.sum())
 
 
 def _potentials(density: BrickVolume, device: str):

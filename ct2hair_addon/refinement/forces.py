@@ -1,16 +1,18 @@
 """What the misfit of strands to a scan asks of each of their control points (3.3.2).
 
 The misfit, blurred as the scanner blurs, is a potential whose slope draws strands. It is needed where they run alone, so it is
-made brick by brick while the segments there read it, and kept nowhere.
+made brick by brick while the segments there read it, and kept nowhere; nor is more of the misfit than three layers of bricks.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
+
 import numba
 import numpy as np
 
-from ..progress import Progress, silent
-from ..volume import BRICK, BrickVolume
+from ..volume import BRICK
 from .binning import FIRST, LAST, RIM, Segments
 from .blur import CHUNK, REACH, blur_block, gaussian_taps, with_rim
 from .curves import segment_samples, spline
@@ -24,55 +26,63 @@ def gather_forces(
     offsets: np.ndarray,
     visible: np.ndarray,
     segments: Segments,
-    field: BrickVolume,
+    bricks: np.ndarray,
+    places: np.ndarray,
+    layers: Iterable[int],
     blur: float,
     forces: np.ndarray,
     weights: np.ndarray,
-    progress: Progress = silent,
 ) -> None:
     """The force on every control point: minus the gradient of a potential across the strand, averaged over its samples.
 
-    points (M, 3) voxels of `field`, whose bricks blurred by `blur` voxels are the potential, 0 outside them; segments: theirs
-    in `field`. Writes forces (M, 3), and weights (M,): the share of visible length around the point, 0..1. The part along
-    the strand is left out: it would only slide points. The same bits on any number of threads.
+    points (M, 3) voxels of a volume, segments: theirs in it. bricks: the volume's, which blurred by `blur` voxels are the
+    potential, 0 outside them; places (x, y, z): where in `bricks` each is, counted from the rim, -1 for none. layers: numbers
+    of the layers across x, in their order, each as it is there; one must stay until two more are. Writes forces (M, 3), and
+    weights (M,): the share of visible length around the point, 0..1. The part along the strand is left out: it would only
+    slide points. The same bits on any number of threads.
     """
     asked = np.empty((len(segments.pair), 8), np.float32)
-    taps, count = gaussian_taps(blur), len(segments.index)
-    for start in range(0, count, CHUNK):
-        progress(start, count)
-        _gather_bricks(
-            points, visible, segments.start, segments.segment, segments.pair, segments.ends, segments.index, field.table,
-            field.bricks, taps, start, min(start + CHUNK, count), asked,
-        )  # fmt: skip
+    taps = gaussian_taps(blur)
+    begin = np.searchsorted(segments.index[:, 0], np.arange(len(places) + 1))
+    known = -1
+    for layer in itertools.chain(layers, [len(places)]):
+        # those of which the next one is there, too
+        for start in range(begin[max(known, 0)], begin[layer], CHUNK):
+            _gather_bricks(
+                points, visible, segments.start, segments.segment, segments.pair, segments.ends, segments.index, places,
+                bricks, taps, start, min(start + CHUNK, begin[layer]), asked,
+            )  # fmt: skip
+        known = layer
     _collect(offsets, segments.begin, asked, forces)
     shares_seen(points, offsets, visible, weights)
 
 
 @numba.njit(cache=True, parallel=True)
-def _gather_bricks(points, visible, starts, segments, pair, ends, index, table, bricks, taps, low, high, asked):
+def _gather_bricks(points, visible, starts, segments, pair, ends, index, places, bricks, taps, low, high, asked):
     """Fill `asked` (P, 8) for pairs in bricks [low, high): at the segment's first and second control point, the force and the
     visible length by which it is weighed."""
     for b in numba.prange(low, high):
         if starts[b] == starts[b + 1]:
             continue
-        i, j, k = index[b, 0] - RIM, index[b, 1] - RIM, index[b, 2] - RIM
+        i, j, k = index[b, 0], index[b, 1], index[b, 2]
         block, values = np.empty((SIDE + 2 * REACH) ** 3, np.float32), np.empty(SIDE**3, np.float32)
-        with_rim(table, bricks, np.float32(0.0), i, j, k, SIDE, block)
+        with_rim(places, bricks, np.float32(0.0), i, j, k, SIDE, block)
         blur_block(block, taps, SIDE, values)
-        _clear_outside(table, i, j, k, values)
+        _clear_outside(places, i, j, k, values)
+        x, y, z = BRICK * (i - RIM), BRICK * (j - RIM), BRICK * (k - RIM)
         for at in range(starts[b], starts[b + 1]):
             m = segments[at]
-            asked[pair[at]] = _asked(points, m, ends[m], visible, BRICK * i, BRICK * j, BRICK * k, values)
+            asked[pair[at]] = _asked(points, m, ends[m], visible, x, y, z, values)
 
 
 @numba.njit(cache=True)
-def _clear_outside(table, i, j, k, values):
+def _clear_outside(places, i, j, k, values):
     """Set `values` (SIDE^3,) of brick (i, j, k) to 0 in bricks that are not stored."""
     for a in range(2):
         for b in range(2):
             for c in range(2):
                 x, y, z = i + a, j + b, k + c
-                if 0 <= x < table.shape[0] and 0 <= y < table.shape[1] and 0 <= z < table.shape[2] and table[x, y, z] >= 0:
+                if x < places.shape[0] and y < places.shape[1] and z < places.shape[2] and places[x, y, z] >= 0:
                     continue
                 for p in range(BRICK if a else 0, SIDE if a else BRICK):
                     for q in range(BRICK if b else 0, SIDE if b else BRICK):

@@ -3,11 +3,13 @@
 Control points of a strand are joined by Catmull-Rom cubics. A segment leaves its length in the eight voxels around each
 of its samples (two a voxel), and a separable Gaussian spreads it. Every brick collects the segments that reach it, in
 strand order, so that the result is the same bits on any number of threads; no two threads write to one voxel. What strands
-leave is held for three layers of bricks across x at a time: those that one layer's blur reads.
+leave is held for three layers of bricks across x at a time, which is what the blur of one layer reads.
 Points are in voxels of the volume at hand throughout.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numba
 import numpy as np
@@ -44,7 +46,9 @@ def render(
     """
     out = np.empty(volume.bricks.shape, np.float32)
     segments = bin_segments(points, offsets, visible, volume.table)
-    _fit_bricks(points, visible, segments, volume, blur, 1.0, 0.0, out, progress)
+    to, errors = np.arange(len(out)), np.empty(len(out))
+    for _ in _layers(points, visible, segments, volume, blur, 1.0, 0.0, out, to, errors, progress):
+        pass
     return out
 
 
@@ -56,44 +60,63 @@ def misfit(
     blur: float,
     gain: float,
     out: np.ndarray,
+    to: np.ndarray,
+    errors: np.ndarray,
     progress: Progress = silent,
-) -> float:
-    """Fill `out` (B, 16, 16, 16) with the weighted misfit `w (gain * rendered - target)`; return half its weighted square sum.
+) -> Iterator[int]:
+    """Write the weighted misfit `w (gain * rendered - target)` of each brick, layer by layer across x; yields the number of
+    each layer, counted from the rim, as it is there.
 
     points, visible: as for `render`; segments: theirs in `target`. gain: density of one voxel of strand length in a voxel.
     `w = 1 / (1 + gain * rendered / peak)`, peak being a lone strand's: noise and model error grow with the hair in a voxel,
-    and one hair more weighs less in a thick bundle.
+    and one hair more weighs less in a thick bundle. out (., 16, 16, 16) float32, to (B,): where in it each brick goes (`ring`
+    keeps three layers). errors (B,): half the weighted square sum of each.
     """
     peak = gain / (2.0 * np.pi * blur**2)
-    return _fit_bricks(points, visible, segments, target, blur, gain, peak, out, progress)
+    return _layers(points, visible, segments, target, blur, gain, peak, out, to, errors, progress)
 
 
-def _fit_bricks(points, visible, segments, volume, blur, gain, peak, out, progress) -> float:
-    index = segments.index
-    layer = np.searchsorted(index[:, 0], np.arange(len(segments.table) + 1))
-    most = int(np.diff(layer).max(initial=0))
-    mass = np.empty((LAYERS * most, BRICK, BRICK, BRICK), np.float32)
-    place = (np.arange(len(index)) - layer[index[:, 0]] + index[:, 0] % LAYERS * most).astype(np.int32)
+def ring(index: np.ndarray, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Room for LAYERS layers of bricks across x, in which one overwrites the third before it.
+
+    index (R, 3): the bricks. Returns (order (R,) by layer; begin (layers + 1,) of each there; place (R,) int32 of each brick in
+    the room; how many bricks it must hold).
+    """
+    order = np.argsort(index[:, 0], kind="stable")
+    layer = index[order, 0]
+    begin = np.searchsorted(layer, np.arange(layers + 1))
+    most = int(np.diff(begin).max(initial=0))
+    place = np.empty(len(index), np.int32)
+    place[order] = np.arange(len(index)) - begin[layer] + layer % LAYERS * most
+    return order, begin, place, LAYERS * most
+
+
+def _layers(points, visible, segments, volume, blur, gain, peak, out, to, errors, progress) -> Iterator[int]:
+    index, own = segments.index, volume.brick_index + np.int32(RIM)
+    _, begin, place, room = ring(index, len(segments.table))
+    mass = np.empty((room, BRICK, BRICK, BRICK), np.float32)
     reached = segments.start[1:] > segments.start[:-1]
     places = np.full_like(segments.table, -1)
     places[tuple(index[reached].T)] = place[reached]
-    own = volume.brick_index
-    order = np.argsort(own[:, 0], kind="stable")
-    done = np.searchsorted(own[order, 0], np.arange(len(places) + 1) - 2 * RIM)
-    taps, errors = splat_taps(blur), np.zeros(len(out))
+    order, filled, _, _ = ring(own, len(places))
+    taps = splat_taps(blur)
     for x in range(len(places)):
-        for start in range(layer[x], layer[x + 1], CHUNK):
+        for start in range(begin[x], begin[x + 1], CHUNK):
             progress(start, len(index))
-            stop = min(start + CHUNK, layer[x + 1])
+            stop = min(start + CHUNK, begin[x + 1])
             _splat_bricks(
                 points, visible, segments.start, segments.segment, segments.ends, index, place, start, stop, mass
             )  # fmt: skip
-        # both neighbours of the layer before this one are there by now
-        for start in range(done[x], done[x + 1], CHUNK):
-            progress(layer[x + 1], len(index))
-            rows = order[start : min(start + CHUNK, done[x + 1])]
-            _spread_bricks(places, mass, own, rows, volume.bricks, np.float32(gain), np.float32(peak), taps, out, errors)
-    return float(errors.sum())
+        if x == 0:
+            continue
+        # both neighbours of the layer before are there by now
+        for start in range(filled[x - 1], filled[x], CHUNK):
+            progress(begin[x + 1], len(index))
+            rows = order[start : min(start + CHUNK, filled[x])]
+            _spread_bricks(
+                places, mass, own, rows, volume.bricks, np.float32(gain), np.float32(peak), taps, out, to, errors
+            )  # fmt: skip
+        yield x - 1
 
 
 def halved(volume: BrickVolume) -> BrickVolume:
@@ -173,18 +196,18 @@ def _splat_bricks(points, visible, starts, segments, ends, index, place, low, hi
 
 
 @numba.njit(cache=True, parallel=True)
-def _spread_bricks(places, mass, index, rows, target, gain, peak, taps, out, errors):
-    """Fill `out` at `rows` with what strands left there and beside it (`mass`, where `places` (x, y, z) says), blurred; with
-    peak > 0, with the weighted misfit of that against `target`, and `errors`."""
+def _spread_bricks(places, mass, index, rows, target, gain, peak, taps, out, to, errors):
+    """Fill `out`, where `to` says, at `rows` with what strands left there and beside it (`mass`, where `places` (x, y, z)
+    says), blurred; with peak > 0, with the weighted misfit of that against `target`, and `errors`."""
     for n in numba.prange(len(rows)):
         b = rows[n]
-        i, j, k = index[b, 0] + RIM, index[b, 1] + RIM, index[b, 2] + RIM
+        i, j, k = index[b, 0], index[b, 1], index[b, 2]
         reached = False
         for a in range(i - 1, i + 2):
             for c in range(j - 1, j + 2):
                 for d in range(k - 1, k + 2):
                     reached = reached or places[a, c, d] >= 0
-        shown, scan = out[b].reshape(BRICK**3), target[b].reshape(BRICK**3)
+        shown, scan = out[to[b]].reshape(BRICK**3), target[b].reshape(BRICK**3)
         if not reached:
             # What the scan has there is unexplained.
             for v in range(BRICK**3):

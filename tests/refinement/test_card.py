@@ -9,9 +9,11 @@ import torch
 from ct2hair_addon.errors import CT2HairError
 from ct2hair_addon.evaluation import render_density
 from ct2hair_addon.refinement import card, device, fit
+from ct2hair_addon.refinement.binning import bin_segments
 from ct2hair_addon.refinement.blur import blurred
 from ct2hair_addon.refinement.curves import control_points
 from ct2hair_addon.refinement.fit import Potential
+from ct2hair_addon.refinement.splat import misfit
 from ct2hair_addon.settings import Settings
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume
@@ -52,10 +54,13 @@ def test_the_card_asks_what_the_processor_asks(scene, chunks, monkeypatch):
         monkeypatch.setattr(card, "ROWS", 7)
     known, here = Potential(scan, BLUR, 1.0), card.CardPotential(scan, BLUR, 1.0, torch.device("cpu"))
     error, forces, weights = asked(known, *scene[1:])
+    residual, errors = np.empty(scan.bricks.shape, np.float32), np.empty(len(scan.bricks))
+    segments = bin_segments(voxels, offsets, visible, scan.table)
+    assert list(misfit(voxels, visible, segments, scan, BLUR, 1.0, residual, np.arange(len(residual)), errors))
     for _ in range(2):  # a second look starts from nothing again
         found, pull, shown = asked(here, voxels, offsets, visible)
         assert found == pytest.approx(error, rel=1e-5)
-        potential = blurred(known.residual, BLUR)
+        potential = blurred(BrickVolume(scan.table, residual, scan.spacing, scan.origin), BLUR)
         np.testing.assert_allclose(here.values[: len(scan.bricks)].numpy(), potential, atol=2e-5 * np.abs(potential).max())
         np.testing.assert_allclose(shown, weights)
         assert np.abs(forces).max() > 0.01

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from ct2hair_addon.refinement.binning import bin_segments
+from ct2hair_addon.refinement.binning import RIM, bin_segments
 from ct2hair_addon.refinement.blur import blurred, gaussian_taps
 from ct2hair_addon.refinement.forces import gather_forces
-from ct2hair_addon.refinement.splat import SPLAT_VARIANCE, _fit_bricks, halved, misfit, render, splat_taps
+from ct2hair_addon.refinement.splat import SPLAT_VARIANCE, _layers, halved, misfit, render, splat_taps
 from ct2hair_addon.volume import BrickVolume
 
 BLUR = 0.85
@@ -153,12 +153,20 @@ def test_halved_are_means_of_8_in_the_same_frame():
     np.testing.assert_allclose(coarse.to_scan([[0, 0, 0]]), volume.to_scan([[0.5, 0.5, 0.5]]))
 
 
+def misfit_of(points, offsets, visible, target, gain, out):
+    """Fill `out` with the misfit; half its weighted square sum."""
+    segments, errors = bin_segments(points, offsets, visible, target.table), np.empty(len(out))
+    layers = misfit(points, visible, segments, target, BLUR, gain, out, np.arange(len(out)), errors)
+    assert list(layers) == list(range(len(segments.table) - 1))
+    return errors.sum()
+
+
 def test_the_misfit_is_what_the_formula_says():
     points, offsets, visible = curves(6)
     target = BrickVolume.from_dense(np.random.default_rng(6).normal(0.1, 0.05, (48, 48, 48)).astype(np.float32), 1.0)
     gain = 0.7
     out = np.empty_like(target.bricks)
-    error = misfit(points, visible, bin_segments(points, offsets, visible, target.table), target, BLUR, gain, out)
+    error = misfit_of(points, offsets, visible, target, gain, out)
     model = gain * render(points, offsets, visible, target, BLUR).astype(np.float64)
     weight = 1.0 / (1.0 + model / (gain / (2 * np.pi * BLUR**2)))
     np.testing.assert_allclose(out, weight * (model - target.bricks), atol=1e-5)
@@ -168,7 +176,8 @@ def test_the_misfit_is_what_the_formula_says():
 def asked(points, offsets, visible, field, blur):
     forces, weights = np.full_like(points, np.nan), np.full(len(points), np.nan)
     segments = bin_segments(points, offsets, visible, field.table)
-    gather_forces(points, offsets, visible, segments, field, blur, forces, weights)
+    places = np.pad(field.table, RIM, constant_values=-1)
+    gather_forces(points, offsets, visible, segments, field.bricks, places, range(len(places)), blur, forces, weights)
     return forces, weights
 
 
@@ -261,21 +270,20 @@ def test_forces_are_the_misfits_slope_by_finite_differences(direction):
 
     def error(step):
         moved = points + step * across
-        segments = bin_segments(moved, offsets, visible, target.table)
+        segments, errors = bin_segments(moved, offsets, visible, target.table), np.empty(len(out))
         # a peak that is never reached: all weights are 1
-        return _fit_bricks(moved, visible, segments, target, BLUR, gain, 1e12, out, lambda *_: None)
+        for _ in _layers(moved, visible, segments, target, BLUR, gain, 1e12, out, np.arange(len(out)), errors, lambda *_: None):
+            pass
+        return errors.sum()
 
     slope = (error(0.1) - error(-0.1)) / 0.2
     error(0.0)
     assert slope > 0  # farther off is worse
-    forces, weights = np.empty_like(points), np.empty(10)
     length = np.full(10, 4.0)
     length[[0, -1]] = 2.0
 
     def from_forces(blur):
-        segments = bin_segments(points, offsets, visible, target.table)
-        misfit = BrickVolume(target.table, out, 1.0, np.zeros(3))
-        gather_forces(points, offsets, visible, segments, misfit, blur, forces, weights)
+        forces, weights = asked(points, offsets, visible, BrickVolume(target.table, out, 1.0, np.zeros(3)), blur)
         np.testing.assert_allclose(weights, 1.0)
         assert np.abs(forces @ along).max() < 1e-5  # nothing along the strand
         return -gain * (length * (forces @ across)).sum()
