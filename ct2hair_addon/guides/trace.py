@@ -24,8 +24,8 @@ MOST_STEPS = 3000
 """Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
 BATCH = 256
 """Seeds followed at once: few enough that two of them seldom meet the same strand, many enough for any number of threads."""
-WINDOW = 32
-"""Times as many seeds are looked at for those at most."""
+WINDOW = 128
+"""Times as many seeds are looked at for those at a time, at most."""
 ALIVE, FAINT = 0.55, 0.2
 """Shares of a strand's density that must be left along a seed's line for it to be followed: at its peak, and where it lies, or
 the peak is not looked for."""
@@ -421,16 +421,18 @@ def trace_segments(
     at, share = 0, 1.0
     progress(0, len(order))
     while at < len(order):
-        window = order[at : at + int(BATCH * min(1.5 / max(share, 1e-3), WINDOW))]
-        alive = np.flatnonzero(_alive(residual.table, residual.bricks, voxels[window], directions[window], profile.seen))
-        share = len(alive) / len(window)
-        if len(alive) > BATCH:
-            used, alive = int(alive[BATCH]), alive[:BATCH]
-        else:
-            used = len(window)
-        tally["seeds already taken"] += used - len(alive)
-        at += used
-        chosen = window[alive]
+        parts, wanted = [], BATCH
+        while wanted and at < len(order):
+            window = order[at : at + int(BATCH * min(1.5 / max(share, 1e-3), WINDOW))]
+            alive = np.flatnonzero(_alive(residual.table, residual.bricks, voxels[window], directions[window], profile.seen))
+            share = len(alive) / len(window)
+            used = int(alive[wanted]) if len(alive) > wanted else len(window)
+            parts.append(window[alive[:wanted]])
+            tally["seeds already taken"] += used - len(parts[-1])
+            wanted -= len(parts[-1])
+            at += used
+            progress(at, len(order))
+        chosen = np.concatenate(parts)
         firsts = np.zeros(len(chosen), np.int64)
         counts = np.zeros((len(chosen), 2), np.int64)
         ends = np.zeros((len(chosen), 2), np.int64)
@@ -447,7 +449,6 @@ def trace_segments(
             tally[END_NAMES[End(ends[n, 0])]] += 1
             tally[END_NAMES[End(ends[n, 1])]] += 1
         tally["paths too short or already taken"] += int((counts[:, 0] < 0).sum())
-        progress(at, len(order))
     sizes = np.array([len(piece) for piece in pieces], np.int64)
     points = np.concatenate(pieces) if pieces else np.zeros((0, 3), np.float32)
     tally["segments"] = len(pieces)

@@ -3,6 +3,7 @@ differences and a plain reading."""
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import pairwise
 
 import numba
@@ -12,6 +13,7 @@ from scipy import ndimage
 
 from ct2hair_addon.refinement.binning import RIM, bin_segments
 from ct2hair_addon.refinement.blur import blurred, gaussian_taps
+from ct2hair_addon.refinement.fit import Potential
 from ct2hair_addon.refinement.forces import gather_forces
 from ct2hair_addon.refinement.splat import SPLAT_VARIANCE, _layers, halved, misfit, render, splat_taps
 from ct2hair_addon.volume import BrickVolume
@@ -292,3 +294,22 @@ def test_forces_are_the_misfits_slope_by_finite_differences(direction):
     assert from_forces(np.sqrt(BLUR**2 - SPLAT_VARIANCE)) == pytest.approx(slope, rel=0.05)
     # under the whole blur, as the fit takes it, it is up to a quarter softer
     assert 0.75 * slope < from_forces(BLUR) < slope
+
+
+def test_a_fit_holds_a_few_layers_of_bricks_and_not_the_volume():
+    points, offsets, visible = curves(8, 20)
+    points = np.concatenate([points + [48.0 * n, 0.0, 0.0] for n in range(20)])
+    offsets, visible = 9 * np.arange(401, dtype=np.int64), np.ones(len(points))
+    scan = BrickVolume.from_dense(np.ones((960, 48, 48), np.int16), 1.0)
+    forces, weights = np.empty_like(points), np.empty(len(points))
+    potential = Potential(scan, BLUR, 1.0)
+    potential.forces(points, offsets, visible, forces, weights)  # what is compiled is not counted
+    del potential
+    tracemalloc.start()
+    try:
+        Potential(scan, BLUR, 1.0).forces(points, offsets, visible, forces, weights)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.abs(forces).max() > 0.01
+    assert peak < 0.5 * 4 * scan.bricks.size
