@@ -12,6 +12,8 @@ REACH = 3
 """Voxels that the Gaussian is cut at: 3.5 standard deviations of the usual 0.85."""
 WIDE = BRICK + 2 * REACH
 """Voxels along an edge of a brick with its rim."""
+LAYERS = 3
+"""Layers of bricks across x that are held at a time: what the blur of one reads."""
 CHUNK = 256
 """Bricks a kernel call: short enough to be cancelled at once."""
 
@@ -24,29 +26,56 @@ def gaussian_taps(blur: float) -> np.ndarray:
 
 
 def blurred(volume: BrickVolume, blur: float, out: np.ndarray | None = None, progress: Progress = silent) -> np.ndarray:
-    """(B, 16, 16, 16) float32: the bricks under a Gaussian of `blur` voxels, `background` taken outside them."""
+    """(B, 16, 16, 16) float32: the bricks under a Gaussian of `blur` voxels, `background` taken outside them.
+
+    out: written to and returned; it may be the volume's own bricks, and no more than three layers of them are held then.
+    """
     out = np.empty(volume.bricks.shape, np.float32) if out is None else out
-    index, taps = volume.brick_index, gaussian_taps(blur)
-    for start in range(0, len(out), CHUNK):
-        progress(start, len(out))
-        stop = min(start + CHUNK, len(out))
-        _blur_bricks(volume.table, volume.bricks, np.float32(volume.background), index, taps, start, stop, out)
+    index, taps, background = volume.brick_index, gaussian_taps(blur), volume.bricks.dtype.type(volume.background)
+    order, begin, place, room = ring(index, len(volume.table))
+    held = np.empty((room, BRICK, BRICK, BRICK), volume.bricks.dtype)
+    places = np.full_like(volume.table, -1)
+    places[tuple(index.T)] = place
+    for x in range(len(places) + 1):
+        for start in range(begin[x], begin[min(x + 1, len(places))], CHUNK):
+            rows = order[start : min(start + CHUNK, begin[x + 1])]
+            held[place[rows]] = volume.bricks[rows]
+        # both neighbours of the layer before are there by now
+        for start in range(begin[max(x - 1, 0)], begin[x], CHUNK):
+            progress(start, len(out))
+            _blur_bricks(places, held, background, index, taps, order[start : min(start + CHUNK, begin[x])], out)
     return out
 
 
+def ring(index: np.ndarray, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Room for LAYERS layers of bricks across x, in which one overwrites the third before it.
+
+    index (R, 3): the bricks. Returns (order (R,) by layer; begin (layers + 1,) of each there; place (R,) int32 of each brick in
+    the room; how many bricks it must hold).
+    """
+    order = np.argsort(index[:, 0], kind="stable")
+    layer = index[order, 0]
+    begin = np.searchsorted(layer, np.arange(layers + 1))
+    most = int(np.diff(begin).max(initial=0))
+    place = np.empty(len(index), np.int32)
+    place[order] = np.arange(len(index)) - begin[layer] + layer % LAYERS * most
+    return order, begin, place, LAYERS * most
+
+
 @numba.njit(cache=True, parallel=True)
-def _blur_bricks(table, bricks, background, index, taps, low, high, out):
-    for b in numba.prange(low, high):
+def _blur_bricks(places, bricks, background, index, taps, rows, out):
+    for n in numba.prange(len(rows)):
+        b = rows[n]
         block = np.empty(WIDE**3, np.float32)
-        with_rim(table, bricks, background, index[b, 0], index[b, 1], index[b, 2], BRICK, block)
+        with_rim(places, bricks, background, index[b, 0], index[b, 1], index[b, 2], BRICK, block)
         blur_block(block, taps, BRICK, out[b].reshape(BRICK**3))
 
 
 @numba.njit(cache=True)
-def with_rim(rows, bricks, background, bi, bj, bk, size, block):
+def with_rim(places, bricks, background, bi, bj, bk, size, block):
     """Fill `block` ((size + 2 REACH)^3,) with `size` voxels from the first of brick (bi, bj, bk) on and REACH to either side.
 
-    rows (x, y, z) tells where in `bricks` each brick lies, -1 for `background`. size: BRICK, or a little more.
+    places (x, y, z) tells where in `bricks` each brick lies, -1 for `background`. size: BRICK, or a little more.
     """
     wide, beyond = size + 2 * REACH, size - BRICK + REACH
     for di in range(-1, 2):
@@ -54,10 +83,10 @@ def with_rim(rows, bricks, background, bi, bj, bk, size, block):
         for dj in range(-1, 2):
             y0, y1 = _span(dj, beyond)
             i, j = bi + di, bj + dj
-            inside = 0 <= i < rows.shape[0] and 0 <= j < rows.shape[1]
-            before = rows[i, j, bk - 1] if inside and 0 < bk <= rows.shape[2] else -1
-            here = rows[i, j, bk] if inside and 0 <= bk < rows.shape[2] else -1
-            after = rows[i, j, bk + 1] if inside and -1 <= bk < rows.shape[2] - 1 else -1
+            inside = 0 <= i < places.shape[0] and 0 <= j < places.shape[1]
+            before = places[i, j, bk - 1] if inside and 0 < bk <= places.shape[2] else -1
+            here = places[i, j, bk] if inside and 0 <= bk < places.shape[2] else -1
+            after = places[i, j, bk + 1] if inside and -1 <= bk < places.shape[2] - 1 else -1
             for x in range(x0, x1):
                 for y in range(y0, y1):
                     p, q = x - REACH - BRICK * di, y - REACH - BRICK * dj

@@ -16,13 +16,13 @@ from ..settings import RefinementSettings
 from ..volume import BRICK, BrickVolume
 from ..volume.strand_signal import StrandProfile
 from .binning import RIM, bin_segments
-from .blur import blurred
+from .blur import blurred, ring
 from .boundary import Boundary
 from .curves import local_curvature, segment_lengths
 from .device import takes_card
 from .forces import gather_forces
 from .motion import keep_lengths, smooth_step
-from .splat import halved, misfit, ring
+from .splat import halved, misfit
 
 LEVEL_BLUR = 0.85
 """Blur of the coarser levels, voxels: as sharp as trilinear reading allows."""

@@ -112,7 +112,7 @@ def excess_of(
         excess[start : start + CHUNK] *= np.float32(gain)
         excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
     if reach:
-        excess = blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach)
+        blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach, excess)
     blur = float(np.hypot(profile.blur, reach))
     wide = blur**2 + INTERPOLATION_VARIANCE
     seen = np.array([1.0, np.exp(-0.5 * RING**2 / wide)]) * blur**2 / wide

@@ -17,13 +17,11 @@ import numpy as np
 from ..progress import Progress, silent
 from ..volume import BRICK, BrickVolume
 from .binning import FIRST, LAST, RIM, Segments, bin_segments
-from .blur import CHUNK, WIDE, blur_block, gaussian_taps, with_rim
+from .blur import CHUNK, WIDE, blur_block, gaussian_taps, ring, with_rim
 from .curves import segment_samples, spline
 
 SPLAT_VARIANCE = 1.0 / 6.0
 """Variance, voxels^2, of the trilinear splat: it counts as part of the blur."""
-LAYERS = 3
-"""Layers of bricks that are held at a time."""
 
 
 def splat_taps(blur: float) -> np.ndarray:
@@ -74,21 +72,6 @@ def misfit(
     """
     peak = gain / (2.0 * np.pi * blur**2)
     return _layers(points, visible, segments, target, blur, gain, peak, out, to, errors, progress)
-
-
-def ring(index: np.ndarray, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Room for LAYERS layers of bricks across x, in which one overwrites the third before it.
-
-    index (R, 3): the bricks. Returns (order (R,) by layer; begin (layers + 1,) of each there; place (R,) int32 of each brick in
-    the room; how many bricks it must hold).
-    """
-    order = np.argsort(index[:, 0], kind="stable")
-    layer = index[order, 0]
-    begin = np.searchsorted(layer, np.arange(layers + 1))
-    most = int(np.diff(begin).max(initial=0))
-    place = np.empty(len(index), np.int32)
-    place[order] = np.arange(len(index)) - begin[layer] + layer % LAYERS * most
-    return order, begin, place, LAYERS * most
 
 
 def _layers(points, visible, segments, volume, blur, gain, peak, out, to, errors, progress) -> Iterator[int]:

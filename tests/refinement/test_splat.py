@@ -144,6 +144,14 @@ def test_blurred_is_scipys_gaussian_across_brick_borders():
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_bricks_are_blurred_in_place_alike():
+    volume = BrickVolume.from_dense(np.random.default_rng(9).normal(size=(100, 33, 50)).astype(np.float32), 1.0)
+    expected = blurred(volume, BLUR)
+    assert (expected != volume.bricks).any()
+    assert blurred(volume, BLUR, volume.bricks) is volume.bricks
+    np.testing.assert_array_equal(volume.bricks, expected)
+
+
 def test_halved_are_means_of_8_in_the_same_frame():
     values = np.random.default_rng(5).normal(size=(48, 16, 80)).astype(np.float32)
     volume = BrickVolume.from_dense(values, 0.5, (3.0, -2.0, 7.0))
