@@ -21,15 +21,21 @@ def density_at(table, bricks, x, y, z):
         row = table[I, J, K]
         value = 0.0
         if row >= 0:
-            u, v, w = x - i, y - j, z - k
-            low = (bricks[row, a, b, c] * (1.0 - w) + bricks[row, a, b, c + 1] * w) * (1.0 - v)
-            low += (bricks[row, a, b + 1, c] * (1.0 - w) + bricks[row, a, b + 1, c + 1] * w) * v
-            high = (bricks[row, a + 1, b, c] * (1.0 - w) + bricks[row, a + 1, b, c + 1] * w) * (1.0 - v)
-            high += (bricks[row, a + 1, b + 1, c] * (1.0 - w) + bricks[row, a + 1, b + 1, c + 1] * w) * v
-            value = low * (1.0 - u) + high * u
+            low = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
+            a += 1
+            high = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
+            value = _amid(low, high, x - i, y - j, z - k)
     else:
         value = trilinear(table, bricks, np.float32(0.0), x, y, z)
     return value
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _amid(low, high, u, v, w):
+    """The trilinear value amid eight voxels: four at the lower x, along z and then y, four at the higher."""
+    near = (low[0] * (1.0 - w) + low[1] * w) * (1.0 - v) + (low[2] * (1.0 - w) + low[3] * w) * v
+    far = (high[0] * (1.0 - w) + high[1] * w) * (1.0 - v) + (high[2] * (1.0 - w) + high[3] * w) * v
+    return near * (1.0 - u) + far * u
 
 
 @numba.njit(cache=True, nogil=True)
@@ -65,13 +71,10 @@ def density_near(table, bricks, patch, x, y, z):
     if 0.0 <= u < PATCH - 1 and 0.0 <= v < PATCH - 1 and 0.0 <= w < PATCH - 1:
         i, j, k = int(u), int(v), int(w)
         at = (i * PATCH + j) * PATCH + k
-        u, v, w = u - i, v - j, w - k
-        low = (values[at] * (1.0 - w) + values[at + 1] * w) * (1.0 - v)
-        low += (values[at + PATCH] * (1.0 - w) + values[at + PATCH + 1] * w) * v
+        low = values[at], values[at + 1], values[at + PATCH], values[at + PATCH + 1]
         at += PATCH * PATCH
-        high = (values[at] * (1.0 - w) + values[at + 1] * w) * (1.0 - v)
-        high += (values[at + PATCH] * (1.0 - w) + values[at + PATCH + 1] * w) * v
-        value = low * (1.0 - u) + high * u
+        high = values[at], values[at + 1], values[at + PATCH], values[at + PATCH + 1]
+        value = _amid(low, high, u - i, v - j, w - k)
     else:
         value = trilinear(table, bricks, np.float32(0.0), x, y, z)
     return value

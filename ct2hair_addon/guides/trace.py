@@ -32,8 +32,8 @@ the peak is not looked for."""
 LOOK = 10
 """voxel; how far ahead the density is summed."""
 HALFWAY, SPARE = 8, 2
-"""voxel; how far ahead the middle of the patch lies in which the density is read, and what it should hold around a path's end
-and the look-ahead's."""
+"""voxel; how far ahead the middle of the patch lies in which the density is read, and what it holds around a path's end and the
+look-ahead's at least."""
 RINGS = ((0.12, 6), (0.26, 8), (0.45, 10))
 """Directions tried around the present one: (tangent of the angle, how many)."""
 TURN_COST = 0.8

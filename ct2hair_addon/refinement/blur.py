@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numba
 import numpy as np
 
@@ -37,14 +39,20 @@ def blurred(volume: BrickVolume, blur: float, out: np.ndarray | None = None, pro
     places = np.full_like(volume.table, -1)
     places[tuple(index.T)] = place
     for x in range(len(places) + 1):
-        for start in range(begin[x], begin[min(x + 1, len(places))], CHUNK):
-            rows = order[start : min(start + CHUNK, begin[x + 1])]
+        for start, stop in chunks(begin[x], begin[min(x + 1, len(places))]):
+            rows = order[start:stop]
             held[place[rows]] = volume.bricks[rows]
         # both neighbours of the layer before are there by now
-        for start in range(begin[max(x - 1, 0)], begin[x], CHUNK):
+        for start, stop in chunks(begin[max(x - 1, 0)], begin[x]):
             progress(start, len(out))
-            _blur_bricks(places, held, background, index, taps, order[start : min(start + CHUNK, begin[x])], out)
+            _blur_bricks(places, held, background, index, taps, order[start:stop], out)
     return out
+
+
+def chunks(low: int, high: int) -> Iterator[tuple[int, int]]:
+    """(start, stop) of CHUNK bricks each from `low` to `high`."""
+    for start in range(low, high, CHUNK):
+        yield start, min(start + CHUNK, high)
 
 
 def ring(index: np.ndarray, layers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
@@ -84,9 +92,9 @@ def with_rim(places, bricks, background, bi, bj, bk, size, block):
             y0, y1 = _span(dj, beyond)
             i, j = bi + di, bj + dj
             inside = 0 <= i < places.shape[0] and 0 <= j < places.shape[1]
-            before = places[i, j, bk - 1] if inside and 0 < bk <= places.shape[2] else -1
-            here = places[i, j, bk] if inside and 0 <= bk < places.shape[2] else -1
-            after = places[i, j, bk + 1] if inside and -1 <= bk < places.shape[2] - 1 else -1
+            before = places[i, j, bk - 1] if inside and bk > 0 else -1
+            here = places[i, j, bk] if inside else -1
+            after = places[i, j, bk + 1] if inside and bk + 1 < places.shape[2] else -1
             for x in range(x0, x1):
                 for y in range(y0, y1):
                     p, q = x - REACH - BRICK * di, y - REACH - BRICK * dj

@@ -18,6 +18,7 @@ LONGEST_EDGE = 8.0
 """mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
 SAMPLES_PER_VOXEL = 2.0
+"""Along a segment that is rendered or reads a volume."""
 SHARES = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)
 """Of what its neighbours want each segment gets so much: edges then grow by degrees."""
 
@@ -109,9 +110,9 @@ def _evaluate_cubics(points, offsets, wanted, out_offsets, out):
                 m += 1
             t = min(max((place - wanted[m]) / (wanted[m + 1] - wanted[m]), 0.0), 1.0)
             at_start, at_end = m == start, m + 2 == end
-            for axis in range(3):
-                a, b, c = spline(points, m, at_start, at_end, axis)
-                out[first + s, axis] = points[m, axis] + t * (a + t * (b + t * c)) if t < 1.0 else points[m + 1, axis]
+            curve = spline(points, m, at_start, at_end)
+            for axis, value in enumerate(spline_at(curve, t)):
+                out[first + s, axis] = value if t < 1.0 else points[m + 1, axis]
 
 
 @numba.njit(cache=True, parallel=True)
@@ -167,14 +168,30 @@ def _turning(points, offsets):
     return turning
 
 
+@numba.njit(cache=True)
+def spline(points, m, first, last):
+    """The Catmull-Rom cubic from control point m (at t = 0) to m + 1 (at t = 1), for `spline_at`: along each axis its
+    coefficients from the constant one on. first, last: whether the strand ends there; the missing point is mirrored."""
+    return _powers(points, m, first, last, 0), _powers(points, m, first, last, 1), _powers(points, m, first, last, 2)
+
+
 @numba.njit(cache=True, inline="always")
-def spline(points, m, first, last, axis):
-    """Along one axis, the Catmull-Rom cubic from control point m (at t = 0) to m + 1 (at t = 1) is `points[m] + t (a + t (b +
-    t c))`: (a, b, c). first, last: whether the strand ends there; the missing point is mirrored."""
+def _powers(points, m, first, last, axis):
     p, q = points[m, axis], points[m + 1, axis]
     before = 2.0 * p - q if first else points[m - 1, axis]
     after = 2.0 * q - p if last else points[m + 2, axis]
-    return 0.5 * (q - before), before - 2.5 * p + 2.0 * q - 0.5 * after, 1.5 * (p - q) + 0.5 * (after - before)
+    return p, 0.5 * (q - before), before - 2.5 * p + 2.0 * q - 0.5 * after, 1.5 * (p - q) + 0.5 * (after - before)
+
+
+@numba.njit(cache=True)
+def spline_at(curve, t):
+    """The point (x, y, z) of a cubic (`spline`) at t in [0, 1]."""
+    x, y, z = curve
+    return (
+        x[0] + t * (x[1] + t * (x[2] + t * x[3])),
+        y[0] + t * (y[1] + t * (y[2] + t * y[3])),
+        z[0] + t * (z[1] + t * (z[2] + t * z[3])),
+    )
 
 
 @numba.njit(cache=True, inline="always")

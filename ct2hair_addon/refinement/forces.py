@@ -14,8 +14,8 @@ import numpy as np
 
 from ..volume import BRICK
 from .binning import FIRST, LAST, RIM, Segments
-from .blur import CHUNK, REACH, blur_block, gaussian_taps, with_rim
-from .curves import segment_samples, spline
+from .blur import REACH, blur_block, chunks, gaussian_taps, with_rim
+from .curves import segment_samples, spline, spline_at
 
 SIDE = BRICK + 1
 """Voxels along an edge of a brick with all that lies around a point in it."""
@@ -44,13 +44,13 @@ def gather_forces(
     asked = np.empty((len(segments.pair), 8), np.float32)
     taps = gaussian_taps(blur)
     begin = np.searchsorted(segments.index[:, 0], np.arange(len(places) + 1))
-    known = -1
+    known = 0
     for layer in itertools.chain(layers, [len(places)]):
         # those of which the next one is there, too
-        for start in range(begin[max(known, 0)], begin[layer], CHUNK):
+        for start, stop in chunks(begin[known], begin[layer]):
             _gather_bricks(
                 points, visible, segments.start, segments.segment, segments.pair, segments.ends, segments.index, places,
-                bricks, taps, start, min(start + CHUNK, begin[layer]), asked,
+                bricks, taps, start, stop, asked,
             )  # fmt: skip
         known = layer
     _collect(offsets, segments.begin, asked, forces)
@@ -93,19 +93,14 @@ def _clear_outside(places, i, j, k, values):
 @numba.njit(cache=True, inline="always")
 def _asked(points, m, ends, visible, ox, oy, oz, values):
     """A segment's part of `asked`: of its samples whose first voxel lies in the brick at (ox, oy, oz)."""
-    first, last = ends & FIRST != 0, ends & LAST != 0
-    ax, bx, cx = spline(points, m, first, last, 0)
-    ay, by, cy = spline(points, m, first, last, 1)
-    az, bz, cz = spline(points, m, first, last, 2)
-    sx, sy, sz = points[m, 0] - ox, points[m, 1] - oy, points[m, 2] - oz
-    count = segment_samples(points, m)
+    curve, count = spline(points, m, ends & FIRST != 0, ends & LAST != 0), segment_samples(points, m)
     share = 1.0 / count
-    px, py, pz = sx, sy, sz
+    px, py, pz = points[m, 0], points[m, 1], points[m, 2]
     fx, fy, fz, gx, gy, gz, here, there = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(count):
         t = (s + 1.0) * share
-        qx, qy, qz = sx + t * (ax + t * (bx + t * cx)), sy + t * (ay + t * (by + t * cy)), sz + t * (az + t * (bz + t * cz))
-        x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+        qx, qy, qz = spline_at(curve, t)
+        x, y, z = 0.5 * (px + qx) - ox, 0.5 * (py + qy) - oy, 0.5 * (pz + qz) - oz
         tx, ty, tz = qx - px, qy - py, qz - pz
         px, py, pz = qx, qy, qz
         i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))

@@ -19,7 +19,7 @@ from ..volume import BrickVolume
 from ..volume.grid import trilinear, voxel
 from ..volume.strand_signal import INTERPOLATION_VARIANCE, StrandProfile, add_strand
 from .blur import CHUNK, blurred
-from .curves import segment_samples, spline
+from .curves import segment_samples, spline, spline_at
 from .splat import render
 
 LEAST_EARNED = 8.0
@@ -146,17 +146,10 @@ def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, e
     total, whole = 0.0, 0.0
     earned[0] = 0.0
     for m in range(start, end - 1):
-        first, last = m == start, m + 2 >= end
-        ax, bx, cx = spline(points, m, first, last, 0)
-        ay, by, cy = spline(points, m, first, last, 1)
-        az, bz, cz = spline(points, m, first, last, 2)
-        count = segment_samples(points, m)
+        curve, count = spline(points, m, m == start, m + 2 >= end), segment_samples(points, m)
         px, py, pz = points[m, 0], points[m, 1], points[m, 2]
         for s in range(count):
-            t = (s + 1.0) / count
-            qx = points[m, 0] + t * (ax + t * (bx + t * cx))
-            qy = points[m, 1] + t * (ay + t * (by + t * cy))
-            qz = points[m, 2] + t * (az + t * (bz + t * cz))
+            qx, qy, qz = spline_at(curve, (s + 1.0) / count)
             tx, ty, tz = qx - px, qy - py, qz - pz
             length = np.sqrt(tx * tx + ty * ty + tz * tz)
             t = (s + 0.5) / count
@@ -229,13 +222,10 @@ def take_out(table, excess, points, visible, start, end, low, high, peak, blur):
     amplitude[0] = -peak * visible[low]
     at = 1
     for m in range(low, high):
-        first, last = m == start, m + 2 >= end
-        count = segment_samples(points, m)
+        curve, count = spline(points, m, m == start, m + 2 >= end), segment_samples(points, m)
         for s in range(count):
             t = (s + 1.0) / count
-            for axis in range(3):
-                a, b, c = spline(points, m, first, last, axis)
-                path[at, axis] = points[m, axis] + t * (a + t * (b + t * c))
+            path[at, 0], path[at, 1], path[at, 2] = spline_at(curve, t)
             amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
             at += 1
     add_strand(table, excess, path, amplitude, blur)

@@ -17,8 +17,8 @@ import numpy as np
 from ..progress import Progress, silent
 from ..volume import BRICK, BrickVolume
 from .binning import FIRST, LAST, RIM, Segments, bin_segments
-from .blur import CHUNK, WIDE, blur_block, gaussian_taps, ring, with_rim
-from .curves import segment_samples, spline
+from .blur import WIDE, blur_block, chunks, gaussian_taps, ring, with_rim
+from .curves import segment_samples, spline, spline_at
 
 SPLAT_VARIANCE = 1.0 / 6.0
 """Variance, voxels^2, of the trilinear splat: it counts as part of the blur."""
@@ -84,21 +84,18 @@ def _layers(points, visible, segments, volume, blur, gain, peak, out, to, errors
     order, filled, _, _ = ring(own, len(places))
     taps = splat_taps(blur)
     for x in range(len(places)):
-        for start in range(begin[x], begin[x + 1], CHUNK):
+        for start, stop in chunks(begin[x], begin[x + 1]):
             progress(start, len(index))
-            stop = min(start + CHUNK, begin[x + 1])
             _splat_bricks(
                 points, visible, segments.start, segments.segment, segments.ends, index, place, start, stop, mass
             )  # fmt: skip
         if x == 0:
             continue
         # both neighbours of the layer before are there by now
-        for start in range(filled[x - 1], filled[x], CHUNK):
+        for start, stop in chunks(filled[x - 1], filled[x]):
             progress(begin[x + 1], len(index))
-            rows = order[start : min(start + CHUNK, filled[x])]
-            _spread_bricks(
-                places, mass, own, rows, volume.bricks, np.float32(gain), np.float32(peak), taps, out, to, errors
-            )  # fmt: skip
+            rows, lone = order[start:stop], np.float32(peak)
+            _spread_bricks(places, mass, own, rows, volume.bricks, np.float32(gain), lone, taps, out, to, errors)
         yield x - 1
 
 
@@ -127,23 +124,14 @@ def _splat_bricks(points, visible, starts, segments, ends, index, place, low, hi
         ox, oy, oz = BRICK * (index[b, 0] - RIM), BRICK * (index[b, 1] - RIM), BRICK * (index[b, 2] - RIM)
         for at in range(starts[b], starts[b + 1]):
             m = segments[at]
-            first, last = ends[m] & FIRST != 0, ends[m] & LAST != 0
-            ax, bx, cx = spline(points, m, first, last, 0)
-            ay, by, cy = spline(points, m, first, last, 1)
-            az, bz, cz = spline(points, m, first, last, 2)
-            sx, sy, sz = points[m, 0] - ox, points[m, 1] - oy, points[m, 2] - oz
-            count = segment_samples(points, m)
+            curve, count = spline(points, m, ends[m] & FIRST != 0, ends[m] & LAST != 0), segment_samples(points, m)
             share = 1.0 / count
-            px, py, pz = sx, sy, sz
+            px, py, pz = points[m, 0], points[m, 1], points[m, 2]
             for s in range(count):
                 # The piece from s to s + 1 leaves its length at its middle.
                 t = (s + 1.0) * share
-                qx, qy, qz = (
-                    sx + t * (ax + t * (bx + t * cx)),
-                    sy + t * (ay + t * (by + t * cy)),
-                    sz + t * (az + t * (bz + t * cz)),
-                )
-                x, y, z = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+                qx, qy, qz = spline_at(curve, t)
+                x, y, z = 0.5 * (px + qx) - ox, 0.5 * (py + qy) - oy, 0.5 * (pz + qz) - oz
                 dx, dy, dz = qx - px, qy - py, qz - pz
                 px, py, pz = qx, qy, qz
                 i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
