@@ -47,10 +47,10 @@ TEXTS = {
     "refinement": "fitting strands to the scan",
     "result": "writing the result",
 }
-AMENDED_BY = RefinementSettings()
+AMENDED_BY = RefinementSettings(iterations=15)
 """How guides are fitted to be amended, whatever is wanted of the refinement: guides then depend on their own settings alone."""
-TRACED, TRACING = "traced", 0.5
-"""The checkpoint within the guides' stage, and the share of the stage that lies before it."""
+TRACED, AMENDING = "traced", 0.6
+"""The checkpoint within the guides' stage, and how long one amendment takes, tracing taking 1."""
 
 _TYPES = (
     BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds, WigScan,
@@ -257,23 +257,30 @@ class _Job:
         return guides
 
     def _guides_amended(self, wig, density, head, fields, progress: Progress) -> Guides:
-        """Traced guides, amended as often as the settings want it; the traced ones are kept until these are there."""
+        """Traced guides, amended as often as the settings want it; what there is before each amendment is kept until all are
+        done."""
         settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
         counted = len(wig.solid_points) > 0
         rounds = settings.guides.amend if settings.guides.method == "trace" else 0
-        share = TRACING if rounds else 1.0
-        guides = self.checkpoints.load(TRACED, self.keys["guides"])
+        share = 1.0 / (1.0 + AMENDING * rounds)
+        keys = [chained_key(self.keys["guides"], amended=number) for number in range(rounds)]
+        done, guides = rounds, None
+        while done and guides is None:
+            done -= 1
+            guides = self.checkpoints.load(TRACED, keys[done])
         if guides is None:
             step = part(progress, 0.0, share)
             guides = trace_guides(
                 density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, counted=counted
             )
             if rounds:
-                self.checkpoints.save(TRACED, self.keys["guides"], guides)
+                self.checkpoints.save(TRACED, keys[0], guides)
         fields.clear()
-        for number in range(rounds if len(guides.strands) else 0):
+        for number in range(done, rounds if len(guides.strands) else 0):
             step = part(part(progress, share, 1.0), number / rounds, (number + 1) / rounds)
             guides = self._amended(guides, number + 1, wig, density, head, step, counted)
+            if number + 1 < rounds:
+                self.checkpoints.save(TRACED, keys[number + 1], guides)
         return guides
 
     def _amended(self, guides: Guides, number: int, wig, density, head, progress: Progress, counted: bool) -> Guides:

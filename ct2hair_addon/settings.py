@@ -100,7 +100,7 @@ class GuideSettings:
         0.15, "a strand of which less than this share was traced in the scan is dropped", low=0.0, high=1.0
     )
     amend: int = parameter(
-        1,
+        2,
         "how often guides are fitted to the scan, what they have too many is cut out and what they lack traced anew",
         low=0,
         high=8,
@@ -345,7 +345,7 @@ _TYPES = {"float": float, "int": int, "str": str, "bool": bool}
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"guides.amend": 0, "refinement.iterations": 15, "refinement.points": 64},
     "standard": {},
-    "final": {"guides.amend": 2, "refinement.iterations": 60, "refinement.points": 192},
+    "final": {"guides.amend": 3, "refinement.iterations": 60, "refinement.points": 192},
     "paper": {
         "orientation.sigma": 0.0,
         "orientation.rho": 1.5,

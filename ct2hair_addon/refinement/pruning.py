@@ -62,12 +62,13 @@ def prune(
         return kept, {REMOVED: 0, CUT_BACK: 0}
     voxels = density.to_voxel(points)
     excess, mark = excess_of(voxels, offsets, visible, density, profile, reach, part(progress, 0.0, 0.7))
-    earned = np.empty(len(counts))
     bare = 0.0 if reach else BARE * mark.peak
-    earn(density.table, excess, density.bricks, bare, voxels, offsets, visible, mark.peak, mark.seen, earned)
+    earned, shown, _ = earnings(density.table, excess, density.bricks, bare, voxels, offsets, visible, mark.peak, mark.seen)
     progress(0.8, 1.0)
-    order = np.argsort(earned, kind="stable")
     traced = np.zeros(len(counts), bool) if traced is None else np.asarray(traced, bool)
+    # what goes makes the others earn more: a strand that stays as it is now needs no second look
+    order = np.argsort(earned, kind="stable")
+    order = order[~traced[order] | (earned[order] < (0.5 - DOUBLE) * shown[order])]
     step = 2000
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
@@ -170,15 +171,21 @@ def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, e
 
 
 @numba.njit(cache=True, parallel=True)
-def earn(table, excess, scan, bare, points, offsets, visible, peak, seen, out):
-    """Fill `out` (N,) with what each strand earns as a whole (`prefix`)."""
-    for n in numba.prange(len(out)):
+def earnings(table, excess, scan, bare, points, offsets, visible, peak, seen):
+    """(earned (N,) by each strand as a whole (`prefix`), its visible length (N,), the most that a stretch of it costs (N,))."""
+    count = len(offsets) - 1
+    whole, shown, loss = np.zeros(count), np.zeros(count), np.zeros(count)
+    for n in numba.prange(count):
         size = offsets[n + 1] - offsets[n]
-        out[n] = 0.0
         if size > 1:
             earned = np.empty(size)
-            prefix(table, excess, scan, bare, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
-            out[n] = earned[size - 1]
+            shown[n] = prefix(table, excess, scan, bare, points, visible, offsets[n], offsets[n + 1], peak, seen, earned)
+            whole[n] = earned[size - 1]
+            top = 0.0
+            for m in range(size):
+                top = max(top, earned[m])
+                loss[n] = max(loss[n], top - earned[m])
+    return whole, shown, loss
 
 
 @numba.njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import SEGMENT_LENGTH, control_points, polylines
+from .curves import SEGMENT_LENGTH, control_points, even_lines, polylines
 from .exchange import exchange_tips
 from .fit import FIRST_SMOOTH, fit_to_volume
 from .pruning import prune
@@ -67,9 +67,9 @@ def refine(
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted; hair_level: density above which a
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
     measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where none runs alone.
-    device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: none goes after the fit, and
-    there are no scores. The same input and seed give the same bits on any number of threads; a graphics card rounds
-    differently. Raises Cancelled (by progress) and CT2HairError (cuda asked for, none there).
+    device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: they are left as fitted,
+    with a point a voxel, and there are neither support nor scores. The same input and seed give the same bits on any number
+    of threads; a graphics card rounds differently. Raises Cancelled (by progress) and CT2HairError (no card for cuda).
     """
     settings = settings or RefinementSettings()
     progress(0.0, 1.0)
@@ -110,11 +110,12 @@ def refine(
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
+    if not final:
+        progress(1.0, 1.0)
+        return Refined(Strands(*even_lines(points, offsets, density.spacing), kept.strand_attributes), tally, {})
     fitted = (Strands(points, offsets), boundary.look(points))
-    scores = {}
-    if final:
-        each = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
-        scores = dict(zip(("before", "after"), each, strict=True))
+    each = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
+    scores = dict(zip(("before", "after"), each, strict=True))
     fine, fine_offsets = polylines(points, offsets)
     fine[fine_offsets[:-1]] = kept.roots
     cleared, inside = boundary.clear(fine, fine_offsets)

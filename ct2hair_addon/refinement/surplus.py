@@ -14,8 +14,8 @@ from ..strands import Strands, offsets_from_counts
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor
 from .boundary import Boundary
-from .curves import control_points, polylines
-from .pruning import earn, excess_of, prefix, take_out
+from .curves import control_points, even_lines
+from .pruning import earnings, excess_of, prefix, take_out
 
 REACH = 2.0
 """voxel that strands may be off by: the misfit is summed over as much."""
@@ -39,12 +39,13 @@ def without_surplus(
     points, offsets, visible = _seen(strands, density, hair_level, head)
     voxels = density.to_voxel(points)
     excess, mark = excess_of(voxels, offsets, visible, density, profile, REACH, part(progress, 0.0, 0.7))
-    earned = np.empty(len(offsets) - 1)
-    earn(density.table, excess, density.bricks, 0.0, voxels, offsets, visible, mark.peak, mark.seen, earned)
+    earned, _, loss = earnings(density.table, excess, density.bricks, 0.0, voxels, offsets, visible, mark.peak, mark.seen)
     edges = np.ones(len(points), bool)
     edges[offsets[1:] - 1] = False
     whole = int(edges.sum())
+    # what is cut out makes the rest earn more: a strand without such a stretch now will have none
     order = np.argsort(earned, kind="stable")
+    order = order[loss[order] >= LEAST_SURPLUS]
     for start in range(0, len(order), CHUNK):
         progress(0.7 + 0.3 * start / len(order), 1.0)
         some = order[start : start + CHUNK]
@@ -53,7 +54,7 @@ def without_surplus(
     points, offsets = _runs(points, offsets, edges)
     tally["pieces kept"] = len(offsets) - 1
     progress(1.0, 1.0)
-    return Strands(*polylines(points, offsets)), tally
+    return Strands(*even_lines(points, offsets, density.spacing)), tally
 
 
 def unexplained(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.evaluation import render_density
-from ct2hair_addon.refinement import unexplained, without_surplus
+from ct2hair_addon.refinement import refine, unexplained, without_surplus
 from ct2hair_addon.strands import Strands, concatenate
 from ct2hair_addon.volume.grid import trilinear
 
@@ -58,6 +58,22 @@ def test_strands_that_explain_the_scan_stay_and_leave_nothing(scan, head, profil
     for place in LANES:
         for along in np.arange(6.0, 54.0, 1.0):
             assert left_at(rest, place, along, profile.seen) == pytest.approx(0.0, abs=0.25)
+
+
+def test_bent_strands_are_fitted_and_kept_as_curves_not_as_chords(head, profile):
+    angle = np.linspace(0.0, 1.5, 121)
+    arc = np.stack([30.0 * np.cos(angle) - 30.0, 0.0 * angle, 52.0 + 30.0 * np.sin(angle)], axis=1)
+    given = Strands.from_array(arc[None].astype(np.float32)).with_attributes(guide=np.ones(1, bool))
+    scan = render_density(given, SPACING, BLUR)
+    fitted = refine(given, scan, LEVEL, head, profile=profile, final=False).strands
+    pieces, _ = without_surplus(fitted, scan, LEVEL, head, profile)
+    assert len(pieces) == 1
+    for points in (fitted.points, pieces.points):
+        radius = np.hypot(points[:, 0] + 30.0, points[:, 2] - 52.0)
+        assert np.abs(radius - 30.0)[5:-5].max() < 0.15 * SPACING
+        middle = 0.5 * (points[1:] + points[:-1])
+        sag = 0.5 * (radius[1:] + radius[:-1]) - np.hypot(middle[:, 0] + 30.0, middle[:, 2] - 52.0)
+        assert np.abs(sag)[5:-5].max() < 0.01 * SPACING
 
 
 def test_one_that_went_over_is_cut_where_it_doubles_and_its_own_way_is_left(scan, head, profile):
