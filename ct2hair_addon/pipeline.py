@@ -276,23 +276,30 @@ class _Job:
             if rounds:
                 self.checkpoints.save(TRACED, keys[0], guides)
         fields.clear()
-        for number in range(done, rounds if len(guides.strands) else 0):
+        held = [guides]  # so is each lot of guides
+        del guides
+        for number in range(done, rounds if len(held[0].strands) else 0):
             step = part(part(progress, share, 1.0), number / rounds, (number + 1) / rounds)
-            guides = self._amended(guides, number + 1, wig, density, head, step, counted)
+            held.append(self._amended(held, number + 1, wig, density, head, step, counted))
             if number + 1 < rounds:
-                self.checkpoints.save(TRACED, keys[number + 1], guides)
-        return guides
+                self.checkpoints.save(TRACED, keys[number + 1], held[0])
+        return held.pop()
 
-    def _amended(self, guides: Guides, number: int, wig, density, head, progress: Progress, counted: bool) -> Guides:
-        """The guides fitted to the scan, what they have too many cut out, and what they lack traced anew."""
+    def _amended(self, held: list[Guides], number: int, wig, density, head, progress: Progress, counted: bool) -> Guides:
+        """The guides, taken out of `held`, fitted to the scan; what they have too many cut out, what they lack traced anew."""
         settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
+        guides = held.pop()
         traced = guides.strands.with_attributes(guide=np.ones(len(guides.strands), bool))
         profile = lone_profile(density, level, traced, lone, part(progress, 0.0, 0.05))
         device, step = settings.run.device, part(progress, 0.05, 0.6)
         fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone, final=False)
         if not len(fitted.strands):
             return guides
+        usual, known = guides.profile, guides.tally
+        del guides, traced
         pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
+        counts = fitted.tally | cut
+        del fitted
         # in a list, to be handed over and held no longer
         fields = [self.checkpoints.load("orientation", self.keys["orientation"])]
         if fields[0] is None:
@@ -302,8 +309,8 @@ class _Job:
         amended = amend_guides(
             pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted=counted
         )
-        tally = {f"amended {number}: {name}": count for name, count in (fitted.tally | cut | amended.tally).items()}
-        return Guides(amended.strands, guides.profile, guides.tally | tally)
+        tally = {f"amended {number}: {name}": count for name, count in (counts | amended.tally).items()}
+        return Guides(amended.strands, usual, known | tally)
 
     def _write(
         self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined, tallies

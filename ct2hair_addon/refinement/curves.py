@@ -17,6 +17,8 @@ TURN_PER_EDGE = 0.25
 LONGEST_EDGE = 8.0
 """mm between two points of an output polyline where hair is straight."""
 LEAST_EDGES, MOST_EDGES = 15, 127
+EVEN = 2.0
+"""voxel between points of strands that are handed on within the engine: a curl's chord is then a twentieth of one off."""
 SAMPLES_PER_VOXEL = 2.0
 """Along a segment that is rendered or reads a volume."""
 SHARES = (1 / 64, 6 / 64, 15 / 64, 20 / 64, 15 / 64, 6 / 64, 1 / 64)

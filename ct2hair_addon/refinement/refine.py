@@ -13,7 +13,7 @@ from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, lone_profile, support_along
 from .agreement import agreements
 from .boundary import Boundary
-from .curves import SEGMENT_LENGTH, control_points, even_lines, polylines
+from .curves import EVEN, SEGMENT_LENGTH, control_points, even_lines, polylines
 from .exchange import exchange_tips
 from .fit import FIRST_SMOOTH, fit_to_volume
 from .pruning import prune
@@ -68,8 +68,8 @@ def refine(
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
     measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where none runs alone.
     device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: they are left as fitted,
-    with a point a voxel, and there are neither support nor scores. The same input and seed give the same bits on any number
-    of threads; a graphics card rounds differently. Raises Cancelled (by progress) and CT2HairError (no card for cuda).
+    with a point every other voxel, and there are neither support nor scores. The same input and seed give the same bits on
+    any number of threads; a graphics card rounds differently. Raises Cancelled and CT2HairError (cuda asked for, no card).
     """
     settings = settings or RefinementSettings()
     progress(0.0, 1.0)
@@ -84,7 +84,7 @@ def refine(
     boundary = Boundary(head, data_floor(density, hair_level, head), density.spacing)
     longest = CHAMFER_SEGMENT if settings.method == "chamfer" else SEGMENT_LENGTH
     points, offsets = control_points(kept, settings.points, longest)
-    given = (Strands(points, offsets), boundary.look(points))
+    given = (Strands(points, offsets), boundary.look(points)) if final else None
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
         points, offsets, kept, counts = _pruned(
@@ -112,7 +112,7 @@ def refine(
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
     if not final:
         progress(1.0, 1.0)
-        return Refined(Strands(*even_lines(points, offsets, density.spacing), kept.strand_attributes), tally, {})
+        return Refined(Strands(*even_lines(points, offsets, EVEN * density.spacing), kept.strand_attributes), tally, {})
     fitted = (Strands(points, offsets), boundary.look(points))
     each = agreements([given, fitted], density, profile, progress=part(progress, 0.9, 0.98))
     scores = dict(zip(("before", "after"), each, strict=True))

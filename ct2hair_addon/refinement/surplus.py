@@ -14,7 +14,7 @@ from ..strands import Strands, offsets_from_counts
 from ..volume import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor
 from .boundary import Boundary
-from .curves import control_points, even_lines
+from .curves import EVEN, control_points, even_lines
 from .pruning import earnings, excess_of, prefix, take_out
 
 REACH = 2.0
@@ -54,7 +54,7 @@ def without_surplus(
     points, offsets = _runs(points, offsets, edges)
     tally["pieces kept"] = len(offsets) - 1
     progress(1.0, 1.0)
-    return Strands(*even_lines(points, offsets, density.spacing)), tally
+    return Strands(*even_lines(points, offsets, EVEN * density.spacing)), tally
 
 
 def unexplained(

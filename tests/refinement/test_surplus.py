@@ -73,7 +73,7 @@ def test_bent_strands_are_fitted_and_kept_as_curves_not_as_chords(head, profile)
         assert np.abs(radius - 30.0)[5:-5].max() < 0.15 * SPACING
         middle = 0.5 * (points[1:] + points[:-1])
         sag = 0.5 * (radius[1:] + radius[:-1]) - np.hypot(middle[:, 0] + 30.0, middle[:, 2] - 52.0)
-        assert np.abs(sag)[5:-5].max() < 0.01 * SPACING
+        assert np.abs(sag)[5:-5].max() < 0.02 * SPACING
 
 
 def test_one_that_went_over_is_cut_where_it_doubles_and_its_own_way_is_left(scan, head, profile):
