@@ -49,7 +49,7 @@ TEXTS = {
 }
 AMENDED_BY = RefinementSettings(iterations=15)
 """How guides are fitted to be amended, whatever is wanted of the refinement: guides then depend on their own settings alone."""
-TRACED, AMENDING = "traced", 0.6
+TRACED, AMENDING = "traced", 0.7
 """The checkpoint within the guides' stage, and how long one amendment takes, tracing taking 1."""
 
 _TYPES = (
