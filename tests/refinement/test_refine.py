@@ -166,7 +166,12 @@ def test_without_iterations_strands_stay_but_for_their_points(fitted, head, prof
 def test_strands_that_are_worked_on_are_fitted_alike_but_not_judged(fitted, head, profile):
     _, given, result, density = fitted["straight"]
     found = refine(given, density, LEVEL, head, profile=profile, final=False)
-    np.testing.assert_array_equal(found.strands.points, result.strands.points)
+    np.testing.assert_allclose(found.strands.tips, result.strands.tips, atol=1e-4)
+    np.testing.assert_allclose(found.strands.roots, given.roots, atol=1e-4)
+    lines = found.strands.resampled_by_step(0.02)
+    distance, nearest = cKDTree(lines.points).query(result.strands.points)
+    assert distance.max() < 0.03
+    np.testing.assert_array_equal(lines.strand_index[nearest], result.strands.strand_index)
     assert found.scores == {} and not any("after fitting" in name for name in found.tally)
     assert result.scores and any("after fitting" in name for name in result.tally)
 
