@@ -207,3 +207,27 @@ def test_guides_are_amended_and_an_interrupted_amendment_goes_on_from_the_traced
     plain = Strands.load(tmp_path / "plain" / "guides.npz")
     scores = [strand_scores(truth, guides)["strand"]["1/10"]["f"] for guides in (plain, amended)]
     assert scores[1] > scores[0] + 0.01
+
+
+def test_an_interrupted_run_goes_on_after_the_last_amendment(scan, tmp_path, monkeypatch):
+    settings, amending, calls = SETTINGS.changed({"guides.amend": 2}), pipeline.amend_guides, []
+    assert pipeline.reconstruct(scan, tmp_path / "whole", settings, until="guides") is None
+
+    def cut_off_at_the_second(*args, **kwargs):
+        calls.append(len(args[0]))
+        if len(calls) == 2:
+            raise Cancelled
+        return amending(*args, **kwargs)
+
+    def traced_again(*args, **kwargs):
+        raise AssertionError("guides were traced already")
+
+    monkeypatch.setattr(pipeline, "amend_guides", cut_off_at_the_second)
+    with pytest.raises(Cancelled):
+        pipeline.reconstruct(scan, tmp_path / "out", settings, until="guides")
+    monkeypatch.setattr(pipeline, "trace_guides", traced_again)
+    assert pipeline.reconstruct(scan, tmp_path / "out", settings, until="guides") is None
+    assert len(calls) == 3 and calls[1] == calls[2] != calls[0]
+    whole, resumed = (Strands.load(tmp_path / name / "guides.npz") for name in ("whole", "out"))
+    np.testing.assert_array_equal(resumed.points, whole.points)
+    assert not (tmp_path / "out" / "checkpoints" / "traced.npz").exists()

@@ -166,8 +166,9 @@ def test_without_iterations_strands_stay_but_for_their_points(fitted, head, prof
 def test_strands_that_are_worked_on_are_fitted_alike_but_not_judged(fitted, head, profile):
     _, given, result, density = fitted["straight"]
     found = refine(given, density, LEVEL, head, profile=profile, final=False)
-    np.testing.assert_allclose(found.strands.tips, result.strands.tips, atol=1e-4)
-    np.testing.assert_allclose(found.strands.roots, given.roots, atol=1e-4)
+    np.testing.assert_array_equal(found.strands.tips, result.strands.tips)
+    np.testing.assert_array_equal(found.strands.roots, result.strands.roots)
+    assert {name: result.tally[name] for name in found.tally} == found.tally
     lines = found.strands.resampled_by_step(0.02)
     distance, nearest = cKDTree(lines.points).query(result.strands.points)
     assert distance.max() < 0.03
