@@ -8,7 +8,7 @@ PYTHON_BPY52 := $(shell for python in python3.13 $(PYENV_ROOT)/versions/3.13*/bi
 RUN := .venv/bin/python
 TORCH ?= any
 
-.PHONY: setup demo test test-gui manual lint extension fetch lock venv52 clean
+.PHONY: setup demo test test-gui manual kernels lint extension fetch lock venv52 clean
 
 ## .venv: Blender 4.5 LTS as a Python module, the engine's packages and the test tools, from wheels/lock.toml
 setup:
@@ -32,6 +32,10 @@ test-gui: setup
 ## docs/settings.md, anew from ct2hair_addon/settings.py
 manual: setup
 	$(RUN) docs/settings_table.py
+
+## ct2hair_addon/kernels.txt, anew from what each command compiles: after a kernel came, went, or changed its arguments
+kernels: setup
+	$(RUN) tests/kernels_list.py
 
 ## the style, the layers of the house (import-linter), and Blender's own validation of the manifest
 lint: setup

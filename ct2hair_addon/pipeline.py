@@ -26,6 +26,7 @@ from .evaluation import write_report
 from .guides import Guides, amend_guides, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
+from .kernels import compiled_ahead
 from .measure import Meter, allowed_memory, machine_memory, needed_memory, release_memory
 from .orientation import OrientationField, field_along, orientation_field
 from .progress import Progress, part
@@ -127,7 +128,8 @@ def reconstruct(
         raise CT2HairError(f"unknown stage '{until}' to stop after; there are {', '.join(STOPS)}")
     check_device(settings.run.device)
     job = _Job(Path(scan), Path(out), settings, raw_shape, raw_type, template, observer or Silent(), until)
-    with _own_folder(job.out), _threads(settings.run.threads):
+    kernels = "paper" if settings.guides.method == "paper" else "reconstruct"
+    with _own_folder(job.out), _threads(settings.run.threads), compiled_ahead(kernels):
         return job.run()
 
 

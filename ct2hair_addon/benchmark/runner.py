@@ -118,9 +118,9 @@ class Bench:
         _write_json(path, result)
         return json.loads(path.read_text(encoding="utf-8"))
 
-    def density(self, folder: Path, head: HeadMesh, settings: Settings) -> BrickVolume:
+    def density(self, folder: Path, head: Head, settings: Settings) -> BrickVolume:
         """The wig's density of a run, the net taken out as in the run itself."""
-        return remove_hairnet(load_vdb(folder / "volume.vdb"), Head(head), settings.head)[0]
+        return remove_hairnet(load_vdb(folder / "volume.vdb"), head, settings.head)[0]
 
     def _measured(self, case: Case, label: str, settings: Settings) -> dict[str, Any]:
         scan = self.scan(case)
@@ -131,21 +131,22 @@ class Bench:
         made = reconstruct(scan.path, folder, settings, observer=_Told(self.say, f"{case.name}, {label}"))
         self.say(f"{case.name}: scoring, {label}")
         scan_report = made.report["scan"]
+        head = Head(made.head)
         voxels = tuple(scale * case.spacing for scale in VOXELS)
         scores = {
-            stage: evaluate(scan.truth, strands, made.head, voxels, QUERIES)
+            stage: evaluate(scan.truth, strands, head, voxels, QUERIES)
             for stage, strands in (("guides", made.guides), ("dense", made.dense), ("refined", made.hair))
         }
         for table in scores.values():  # whatever the voxel, the first is the finer one
             table["voxel"] = dict(zip(("fine", "coarse"), table["voxel"].values(), strict=True))
-        density = self.density(folder, made.head, settings)
+        density = self.density(folder, head, settings)
         level = scan_report["hair_level"]
         own = scores["guides"]
         own["centre_line_mm"] = centre_line_error(made.guides, scan.truth)
         own["coverage"] = coverage(made.guides, density, level, COVERED * case.spacing)
         for stage, strands in (("guides", made.guides), ("refined", made.hair)):
             scores[stage]["direction"] = direction_share(strands, scan.truth, QUERIES)
-            scores[stage]["rooted_length"] = rooted_length(strands, made.head)
+            scores[stage]["rooted_length"] = rooted_length(strands, head)
         stages = [{name: value for name, value in stage.items() if name != "tally"} for stage in made.report["stages"]]
         return {
             "case": asdict(case) | {"fill": case.fill},

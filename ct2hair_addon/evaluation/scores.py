@@ -72,7 +72,7 @@ _PER_CALL = 50_000
 def evaluate(
     truth: Strands,
     result: Strands,
-    head: HeadMesh | None = None,
+    head: HeadMesh | Head | None = None,
     voxels: Sequence[float] = (0.5, 1.0),
     queries: int = QUERIES,
     progress: Progress = silent,
@@ -162,9 +162,9 @@ def strand_scores(truth: Strands, result: Strands, queries: int = QUERIES, progr
     return {"strand": table, "consistency": consistency, "asked": asked}
 
 
-def head_scores(result: Strands, head: HeadMesh, queries: int = QUERIES) -> dict[str, float]:
+def head_scores(result: Strands, head: HeadMesh | Head, queries: int = QUERIES) -> dict[str, float]:
     """Share of strands rooted on the scalp, and share of points (every millimetre) inside the head."""
-    surface = Head(head)
+    surface = _as_head(head)
     strands = result.select(result.counts > 0)
     if not len(strands):
         return {"roots_on_scalp": 0.0, "inside_head": 0.0}
@@ -172,6 +172,10 @@ def head_scores(result: Strands, head: HeadMesh, queries: int = QUERIES) -> dict
     points = sample_curves(strands.select(_drawn(_millimetres(strands), queries)), 2.0 * TARGET_STEP).points
     depth = surface.signed_distance(points, INSIDE)
     return {"roots_on_scalp": float(on_scalp.mean()), "inside_head": float((depth < -INSIDE).mean())}
+
+
+def _as_head(head: HeadMesh | Head) -> Head:
+    return head if isinstance(head, Head) else Head(head)
 
 
 def direction_share(result: Strands, truth: Strands, queries: int = QUERIES) -> dict[str, float]:
@@ -199,12 +203,12 @@ def direction_share(result: Strands, truth: Strands, queries: int = QUERIES) -> 
     return {"right": _ratio(right, compared), "compared": _ratio(compared, len(points))}
 
 
-def rooted_length(strands: Strands, head: HeadMesh) -> float:
+def rooted_length(strands: Strands, head: HeadMesh | Head) -> float:
     """Share of the length that lies on strands whose first point is on the scalp (ROOT_REACH)."""
     kept = strands.select(strands.counts > 0)
     if not len(kept):
         return 0.0
-    rooted = Head(head).closest_scalp(kept.roots).distance <= ROOT_REACH
+    rooted = _as_head(head).closest_scalp(kept.roots).distance <= ROOT_REACH
     lengths = kept.lengths().astype(np.float64)
     return _ratio(lengths[rooted].sum(), lengths.sum())
 

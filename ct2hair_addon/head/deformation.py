@@ -55,19 +55,21 @@ class Lattice:
 
     def fitted(self, blend: csr_matrix, wanted, weight, bending, slope, start) -> np.ndarray:
         """(N, 3) coefficients: least squares of `blend @ rows @ c` (M, 3) to `wanted`, weights (M,), plus the penalties."""
-        penalty = (bending * self.bending + slope * self.slope).tocsr()
-        return least_squares((blend @ self.rows).tocsr(), wanted, weight, penalty, start)
+        normal, right = _normal_equations(blend, wanted, weight)
+        penalty = bending * self.bending + slope * self.slope
+        return _conjugate_gradients(self.rows.T @ (normal @ self.rows) + penalty, self.rows.T @ right, start)
 
 
 def least_squares(rows: csr_matrix, wanted, weight, penalty: csr_matrix, start) -> np.ndarray:
     """(N, 3) x that makes sum(weight |rows @ x - wanted|^2) + x' penalty x least, from `start` (N, 3)."""
+    normal, right = _normal_equations(rows, wanted, weight)
+    return _conjugate_gradients(normal + penalty, right, start)
+
+
+def _normal_equations(rows, wanted, weight):
+    """Matrix and right side of the least squares: there are far fewer unknowns than rows, so a step costs a tenth."""
     columns = (diags(weight) @ rows).T.tocsr()
-    diagonal = np.asarray(rows.multiply(rows).T @ weight).ravel() + penalty.diagonal() + 1e-12
-
-    def matrix(x):
-        return columns @ (rows @ x) + penalty @ x
-
-    return _conjugate_gradients(matrix, columns @ wanted, diagonal[:, None], start)
+    return columns @ rows, columns @ wanted
 
 
 def _penalties(used, size, spacing):
@@ -99,10 +101,12 @@ def _penalties(used, size, spacing):
     return sum(bending).tocsr(), sum(slope).tocsr()
 
 
-def _conjugate_gradients(matrix, right, diagonal, start):
+def _conjugate_gradients(matrix, right, start):
     """The three columns of a symmetric positive system at once, preconditioned by its diagonal."""
+    matrix = matrix.tocsr()
+    diagonal = matrix.diagonal()[:, None] + 1e-12
     x = start.copy()
-    residual = right - matrix(x)
+    residual = right - matrix @ x
     scaled = residual / diagonal
     direction = scaled.copy()
     energy = (residual * scaled).sum(axis=0)
@@ -110,7 +114,7 @@ def _conjugate_gradients(matrix, right, diagonal, start):
     for _ in range(PASSES):
         if (energy <= enough).all():
             break
-        image = matrix(direction)
+        image = matrix @ direction
         step = energy / np.maximum((direction * image).sum(axis=0), 1e-30)
         x += step * direction
         residual -= step * image

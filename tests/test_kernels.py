@@ -1,0 +1,120 @@
+"""Kernels compiled ahead: the list is what commands call, and the helper is no bother."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numba import types
+
+from ct2hair_addon import kernels
+
+COMMANDS = ("synthesize", "reconstruct", "paper", "evaluate")
+
+
+def record(command: list[str]) -> list[str]:
+    script = Path(__file__).with_name("kernels_list.py")
+    done = subprocess.run([sys.executable, script, "--", *command], capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_every_line_names_a_kernel_and_as_many_arguments_as_it_takes():
+    lines = kernels.listed(COMMANDS)
+    assert len(lines) > 80 and len(set(lines)) == len(lines)
+    names = {kind: getattr(types, kind) for kind in dir(types)}
+    for line in lines:
+        path, _, kinds = line.removesuffix(")").partition("(")
+        module, _, name = path.rpartition(".")
+        kernel = getattr(import_module(f"ct2hair_addon.{module}"), name)
+        inspect.signature(kernel.py_func).bind(*eval(f"[{kinds}]", dict(names)))
+
+
+def test_nothing_is_called_that_is_not_listed(tmp_path):
+    """A scan is made and reconstructed as users do, each in a process of its own, and what they call is written down."""
+    scan = str(tmp_path / "bob.nrrd")
+    missing = "run `make kernels`: these are called and not in kernels.txt"
+    synthesized = record(["synthesize", "bob", "--strands", "700", "--spacing", "1.2", "--seed", "8", "--out", scan])
+    assert not set(synthesized) - set(kernels.listed(["synthesize"])), missing
+    reconstructed = record(["reconstruct", scan, "--out", str(tmp_path / "out")])
+    assert len(reconstructed) > 60
+    assert not set(reconstructed) - set(kernels.listed(["reconstruct"])), missing
+
+
+def test_what_is_written_down_can_be_compiled_again(monkeypatch):
+    module = sys.modules[__name__]
+    monkeypatch.setattr(kernels, "__package__", "tests_of")
+    monkeypatch.setitem(sys.modules, f"{kernels.__package__}.made", module)
+
+    @numba.njit
+    def summed(values, weights, pair, scale=None):
+        return values.sum() * weights[0, 0] + pair[0] + pair[1]
+
+    summed.py_func.__module__ = f"{kernels.__package__}.made"
+    with kernels.recorded() as lines:
+        summed(np.ones(3, np.float32), np.ones((2, 2), order="F"), (1, 2.0))
+    assert lines == ["made.summed(float32[::1], float64[::1, :], Tuple([int64, float64]), Omitted(None))"]
+    again = numba.njit(summed.py_func)
+    monkeypatch.setattr(module, "summed", again, raising=False)
+    kernels.compile_kernel(lines[0])
+    assert again.signatures == summed.signatures
+    kernels.compile_kernel(lines[0])  # once more is nothing
+    assert len(again.signatures) == 1
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    if numba.get_num_threads() < 2:
+        pytest.skip("there is one core, and no helper")
+    return tmp_path
+
+
+def test_the_helper_goes_with_the_block_and_leaves_no_trace_of_being_at_work(own_cache):
+    with kernels.compiled_ahead("synthesize"):
+        until = time.monotonic() + 60.0
+        while not (own_cache / "ahead.txt").exists():
+            assert time.monotonic() < until, "the helper did not begin"
+            time.sleep(0.05)
+        assert not kernels._wanted(["synthesize"]), "one helper is enough"
+    assert not (own_cache / "ahead.txt").exists()
+    assert not (own_cache / "ahead-synthesize.txt").exists(), "it was not done"
+    assert kernels._wanted(["synthesize"])
+
+
+def test_the_helper_ends_when_its_starter_is_gone(own_cache):
+    helper = kernels._helper(["reconstruct"])
+    until = time.monotonic() + 60.0
+    while not (own_cache / "ahead.txt").exists():
+        assert time.monotonic() < until, "the helper did not begin"
+        time.sleep(0.05)
+    helper.stdin.close()  # as the system does when a process ends, however it does
+    try:
+        assert helper.wait(timeout=10.0) != 0
+    finally:
+        helper.kill()
+
+
+def test_what_is_compiled_is_not_compiled_again_until_a_source_changes(own_cache, monkeypatch):
+    (own_cache / "ahead-evaluate.txt").write_text(kernels.fingerprint())
+    assert not kernels._wanted(["evaluate"])
+    assert kernels._wanted(["evaluate", "synthesize"])
+    monkeypatch.setattr(kernels, "fingerprint", lambda: "other sources")
+    assert kernels._wanted(["evaluate"])
+
+
+def test_a_helper_that_cannot_start_is_no_error(own_cache, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(own_cache / "no-such-python"))
+    with kernels.compiled_ahead("evaluate"):
+        pass
+    monkeypatch.setattr(kernels, "__package__", "bl_ext.user_default.ct2hair.ct2hair_addon")
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("inside Blender kernels lie elsewhere"))
+    with kernels.compiled_ahead("evaluate"):
+        pass
