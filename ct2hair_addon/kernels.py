@@ -97,7 +97,7 @@ def _written(kind: Any) -> str:
         axes = [":"] * kind.ndim
         if kind.layout != "A":
             axes[-1 if kind.layout == "C" else 0] = "::1"
-        return f"{kind.dtype}[{', '.join(axes)}]"
+        return f"{_written(kind.dtype)}[{', '.join(axes)}]"
     if isinstance(kind, types.BaseTuple):
         return f"Tuple([{', '.join(map(_written, kind))}])"
     if isinstance(kind, types.Omitted):

@@ -185,8 +185,8 @@ def _orient(
         size = blocks[n, 3:] * BRICK - low
         block = np.empty((size[0] + 2 * halo, size[1] + 2 * halo, size[2] + 2 * halo), np.float32)
         gather(table, bricks, background, low[0] - halo, low[1] - halo, low[2] - halo, block)
-        gx, gy, gz, smoothed = gradients(block, smooth, slope)
-        sums = tensor(gx, gy, gz, window)
+        gradient = gradients(block, smooth, slope)
+        sums = tensor(gradient, window)
         reach = len(window) // 2
         for I in range(blocks[n, 0], blocks[n, 3]):
             for J in range(blocks[n, 1], blocks[n, 4]):
@@ -195,19 +195,19 @@ def _orient(
                     if row < 0:
                         continue
                     _orient_brick(
-                        sums, gx, gy, gz, smoothed, I * BRICK - low[0], J * BRICK - low[1], K * BRICK - low[2], reach, level,
+                        sums, gradient, I * BRICK - low[0], J * BRICK - low[1], K * BRICK - low[2], reach, level,
                         noise, lowest, reweighting, direction[row], confidence[row], counts[n],
                     )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def _orient_brick(
-    sums, gx, gy, gz, smoothed, x, y, z, reach, level, noise, lowest, reweighting, direction, confidence, count
+    sums, gradient, x, y, z, reach, level, noise, lowest, reweighting, direction, confidence, count
 ):  # fmt: skip
     for i in range(BRICK):
         for j in range(BRICK):
             for k in range(BRICK):
-                if smoothed[x + i + reach, y + j + reach, z + k + reach] <= level:
+                if gradient[3, x + i + reach, y + j + reach, z + k + reach] <= level:
                     continue
                 count[0] += 1
                 a, b, c = x + i, y + j, z + k
@@ -216,7 +216,7 @@ def _orient_brick(
                     float(sums[3, a, b, c]), float(sums[4, a, b, c]), float(sums[5, a, b, c]),
                 )  # fmt: skip
                 for _ in range(reweighting):
-                    ox, oy, oz, small, middle, _large = _reweighted(gx, gy, gz, a, b, c, 2 * reach + 1, ox, oy, oz)
+                    ox, oy, oz, small, middle, _large = _reweighted(gradient, a, b, c, 2 * reach + 1, ox, oy, oz)
                 certain = min(max((middle - small) / max(middle - noise, noise, 1e-30), 0.0), 1.0)
                 if certain < lowest:
                     continue
@@ -228,7 +228,7 @@ def _orient_brick(
 
 
 @numba.njit(cache=True, nogil=True)
-def _reweighted(gx, gy, gz, a, b, c, size, ox, oy, oz):
+def _reweighted(gradient, a, b, c, size, ox, oy, oz):
     """One step of iteratively reweighted least squares (L1) over the box of `size` voxels from (a, b, c): gradients that lie
     along
     the present direction are outliers and weigh less."""
@@ -236,13 +236,13 @@ def _reweighted(gx, gy, gz, a, b, c, size, ox, oy, oz):
     for i in range(a, a + size):
         for j in range(b, b + size):
             for k in range(c, c + size):
-                total += abs(gx[i, j, k] * ox + gy[i, j, k] * oy + gz[i, j, k] * oz)
+                total += abs(gradient[0, i, j, k] * ox + gradient[1, i, j, k] * oy + gradient[2, i, j, k] * oz)
     floor = 0.1 * total / size**3 + 1e-12
     xx = xy = xz = yy = yz = zz = weights = 0.0
     for i in range(a, a + size):
         for j in range(b, b + size):
             for k in range(c, c + size):
-                x, y, z = float(gx[i, j, k]), float(gy[i, j, k]), float(gz[i, j, k])
+                x, y, z = float(gradient[0, i, j, k]), float(gradient[1, i, j, k]), float(gradient[2, i, j, k])
                 weight = 1.0 / max(abs(x * ox + y * oy + z * oz), floor)
                 weights += weight
                 xx += weight * x * x

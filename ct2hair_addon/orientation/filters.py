@@ -39,75 +39,86 @@ def box_taps(radius: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def filter_z(block, taps):
-    """The correlation of `block` with `taps` along z; shorter along z by len(taps) - 1."""
-    nx, ny, nz = block.shape[0], block.shape[1], block.shape[2] - len(taps) + 1
-    out = np.zeros((nx, ny, nz), np.float32)
-    for i in range(nx):
-        for j in range(ny):
+def filter_z(block, taps, out):
+    """The correlation of `block` with `taps` along z into `out`, which is shorter along z by len(taps) - 1."""
+    out[:] = 0.0
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             row, target = block[i, j], out[i, j]
             for t in range(len(taps)):
                 weight = taps[t]
-                for k in range(nz):
+                for k in range(len(target)):
                     target[k] += weight * row[k + t]
-    return out
 
 
 @numba.njit(cache=True, nogil=True)
-def filter_y(block, taps):
+def filter_y(block, taps, out):
     """The same along y."""
-    nx, ny, nz = block.shape[0], block.shape[1] - len(taps) + 1, block.shape[2]
-    out = np.zeros((nx, ny, nz), np.float32)
-    for i in range(nx):
-        for j in range(ny):
+    out[:] = 0.0
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             target = out[i, j]
             for t in range(len(taps)):
                 weight = taps[t]
                 row = block[i, j + t]
-                for k in range(nz):
+                for k in range(len(target)):
                     target[k] += weight * row[k]
-    return out
 
 
 @numba.njit(cache=True, nogil=True)
-def filter_x(block, taps):
+def filter_x(block, taps, out):
     """The same along x."""
-    nx, ny, nz = block.shape[0] - len(taps) + 1, block.shape[1], block.shape[2]
-    out = np.zeros((nx, ny, nz), np.float32)
-    for i in range(nx):
-        for j in range(ny):
+    out[:] = 0.0
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             target = out[i, j]
             for t in range(len(taps)):
                 weight = taps[t]
                 row = block[i + t, j]
-                for k in range(nz):
+                for k in range(len(target)):
                     target[k] += weight * row[k]
-    return out
+
+
+# Each filter is called in one place of a function: numba puts its code wherever it is called, and compiles all of that.
 
 
 @numba.njit(cache=True, nogil=True)
 def gradients(block, smooth, slope):
-    """The gradient (eq. 1) and the smoothed block, four arrays shorter by len(taps) - 1 along each axis.
+    """(4, ...) the gradient (eq. 1) along x, y and z, and the smoothed block, shorter by len(taps) - 1 along each axis.
 
     `smooth` and `slope` must have one length: `smooth` is padded by the caller where it is shorter.
     """
-    in_z, slope_z = filter_z(block, smooth), filter_z(block, slope)
-    in_yz = filter_y(in_z, smooth)
-    along_z = filter_x(filter_y(slope_z, smooth), smooth)
-    along_y = filter_x(filter_y(in_z, slope), smooth)
-    return filter_x(in_yz, slope), along_y, along_z, filter_x(in_yz, smooth)
+    reach = len(smooth) - 1
+    nx, ny, nz = block.shape
+    taps = (smooth, slope)
+    in_z = np.empty((2, nx, ny, nz - reach), np.float32)  # smoothed, derived
+    for n in range(2):
+        filter_z(block, taps[n], in_z[n])
+    in_yz = np.empty((3, nx, ny - reach, nz - reach), np.float32)  # smoothed, derived along y, along z
+    for n in range(3):
+        filter_y(in_z[n // 2], taps[n % 2], in_yz[n])
+    out = np.empty((4, nx - reach, ny - reach, nz - reach), np.float32)
+    for n in range(4):
+        filter_x(in_yz[n % 3], taps[1 if n == 0 else 0], out[n])
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
-def tensor(gx, gy, gz, window):
-    """(6, ...) xx, xy, xz, yy, yz, zz: the outer products of the gradients, weighted by `window` along each axis and summed."""
-    nx, ny, nz = gx.shape
+def tensor(gradient, window):
+    """(6, ...) xx, xy, xz, yy, yz, zz: the outer products of `gradient` (3 or more, ...), weighted by `window` along each axis
+    and summed."""
+    _, nx, ny, nz = gradient.shape
     reach = len(window) - 1
+    in_z = np.empty((nx, ny, nz - reach), np.float32)
+    in_yz = np.empty((nx, ny - reach, nz - reach), np.float32)
     out = np.empty((6, nx - reach, ny - reach, nz - reach), np.float32)
-    for c in range(6):
-        a = gx if c < 3 else (gy if c < 5 else gz)
-        b = gx if c == 0 else (gy if c == 1 or c == 3 else gz)
-        out[c] = filter_x(filter_y(filter_z(a * b, window), window), window)
+    c = 0
+    for a in range(3):
+        for b in range(a, 3):
+            filter_z(gradient[a] * gradient[b], window, in_z)
+            filter_y(in_z, window, in_yz)
+            filter_x(in_yz, window, out[c])
+            c += 1
     return out
 
 

@@ -119,11 +119,14 @@ def local_mean(block, reach):
                 for k in range(z):
                     total[j, k] -= block[i - width, j, k]
         if i >= width - 1:
-            a[i - width + 1] = total
+            for j in range(y):
+                for k in range(z):
+                    a[i - width + 1, j, k] = total[j, k]
     b = np.empty((a.shape[0], y - 2 * reach, z), np.float32)
     row = np.zeros(z, np.float32)
     for i in range(a.shape[0]):
-        row[:] = 0.0
+        for k in range(z):
+            row[k] = 0.0
         for j in range(y):
             for k in range(z):
                 row[k] += a[i, j, k]
@@ -131,7 +134,8 @@ def local_mean(block, reach):
                 for k in range(z):
                     row[k] -= a[i, j - width, k]
             if j >= width - 1:
-                b[i, j - width + 1] = row
+                for k in range(z):
+                    b[i, j - width + 1, k] = row[k]
     c = np.empty((b.shape[0], b.shape[1], z - 2 * reach), np.float32)
     share = np.float32(1.0 / width**3)
     for i in range(c.shape[0]):
