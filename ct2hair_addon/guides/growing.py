@@ -29,6 +29,8 @@ WALK_POINTS, WALK_TURN = 16, 0.3
 """Neighbours that are listened to, and the weight of what they say against the way so far."""
 WALK_AHEAD = WALK_STEP * ((1.0 - WALK_TURN) / WALK_TURN + 0.5)
 """mm ahead that they are asked at: by so much the way lags behind, and over a curved scalp a lag would lead off it."""
+THREADED = 1000
+"""Walkers from which on a step asks on all cores: to start a query's threads takes as long as fewer do."""
 LONGEST_WALK = 150.0
 """mm that a strand is followed back at most."""
 
@@ -167,7 +169,8 @@ def walked_back(
         if not len(going):
             break
         place, onward = path[step - 1, going].astype(np.float64), way[going]
-        distance, near = tree.query(place - WALK_AHEAD * onward, k=WALK_POINTS, distance_upper_bound=WALK_REACH, workers=-1)
+        asked, workers = place - WALK_AHEAD * onward, 1 if len(going) < THREADED else -1
+        distance, near = tree.query(asked, k=WALK_POINTS, distance_upper_bound=WALK_REACH, workers=workers)
         found = np.isfinite(distance)
         near, distance = np.where(found, near, 0), np.where(found, distance, WALK_REACH)
         found &= index[near] != walkers[going][:, None]
