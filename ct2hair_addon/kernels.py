@@ -40,7 +40,8 @@ def compiled_ahead(*commands: str) -> Iterator[None]:
         if helper is not None:
             helper.kill()
             helper.wait()
-            _beat().unlink(missing_ok=True)
+            with suppress(OSError):
+                _beat().unlink()
 
 
 def listed(commands: Iterable[str]) -> list[str]:
@@ -109,7 +110,9 @@ def _wanted(commands: Sequence[str]) -> bool:
     """Whether a helper would be of use: kernels lie where the helper puts them, a core is free for it, not all is done."""
     import numba
 
-    if __package__ != OWN_NAME or numba.config.DISABLE_JIT or numba.get_num_threads() < 2:
+    if __package__ != OWN_NAME or "NUMBA_CACHE_DIR" not in os.environ:
+        return False
+    if numba.config.DISABLE_JIT or numba.get_num_threads() < 2:
         return False
     try:
         if all(_stamp(command).read_text(encoding="utf-8") == fingerprint() for command in commands):
