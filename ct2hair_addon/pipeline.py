@@ -337,7 +337,7 @@ class _Job:
             "scan": {
                 "file": self.scan.name,
                 "spacing_mm": wig.density.spacing,
-                "hair_voxels": int(np.count_nonzero(wig.density.bricks > wig.hair_level)),
+                "hair_voxels": int(wig.density.count_above(wig.hair_level).sum()),
                 "stored_voxels": int(wig.density.bricks.size),
                 "hair_level": wig.hair_level,
             },

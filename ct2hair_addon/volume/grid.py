@@ -87,6 +87,12 @@ class BrickVolume:
         """Continuous voxel indices -> scan frame (mm)."""
         return np.asarray(voxels, np.float64) * self.spacing + self.origin
 
+    def count_above(self, level: float) -> np.ndarray:
+        """(B,) int64: how many voxels of each brick exceed `level`."""
+        counts = np.empty(len(self.bricks), np.int64)
+        _count_above(self.bricks, float(level), counts)
+        return counts
+
     def sample(self, points: np.ndarray) -> np.ndarray:
         """(M,) float32: trilinear values at points (M, 3) of the scan frame, mm."""
         return _sample(self.table, self.bricks, np.float32(self.background), self.to_voxel(points))
@@ -129,6 +135,17 @@ def gather(table, bricks, background, low_x, low_y, low_z, out):
         for j in range(out.shape[1]):
             for k in range(out.shape[2]):
                 out[i, j, k] = voxel(table, bricks, background, low_x + i, low_y + j, low_z + k)
+
+
+@numba.njit(cache=True, parallel=True)
+def _count_above(bricks, level, counts):
+    for b in numba.prange(len(bricks)):
+        count = 0
+        for i in range(BRICK):
+            for j in range(BRICK):
+                for k in range(BRICK):
+                    count += bricks[b, i, j, k] > level
+        counts[b] = count
 
 
 @numba.njit(cache=True, parallel=True)

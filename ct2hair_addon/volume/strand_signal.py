@@ -181,7 +181,7 @@ def data_floor(density: BrickVolume, hair_level: float, head, sample: int = 200_
 
     `head` answers `signed_distance(points)`. A low quantile over a sample of hair voxels: robust to a few left-overs.
     """
-    per_brick = np.count_nonzero(density.bricks > hair_level, axis=(1, 2, 3))
+    per_brick = density.count_above(hair_level)
     total = int(per_brick.sum())
     if total == 0:
         return 0.0

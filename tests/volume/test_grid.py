@@ -36,3 +36,14 @@ def test_brick_index_names_the_brick_of_each_row():
     for row, (i, j, k) in enumerate(volume.brick_index):
         low = 16 * np.array([i, j, k])
         np.testing.assert_array_equal(volume.bricks[row], volume.block(low, low + 16))
+
+
+def test_voxels_above_a_level_are_counted_brick_by_brick():
+    generator = np.random.default_rng(6)
+    for values in (
+        generator.normal(0.0, 9.0, (40, 20, 33)).astype(np.float32),
+        generator.integers(-90, 90, (17, 16, 50), np.int16),
+    ):
+        volume = BrickVolume.from_dense(values, 0.5)
+        for level in (-5.0, 0.0, 7.3):
+            np.testing.assert_array_equal(volume.count_above(level), (volume.bricks > level).sum(axis=(1, 2, 3)))

@@ -8,7 +8,8 @@ import pytest
 from ct2hair_addon.evaluation import render_density, strand_peak
 from ct2hair_addon.guides.profile import strand_profile
 from ct2hair_addon.strands import Strands
-from ct2hair_addon.volume.strand_signal import TYPICAL_BLUR, StrandProfile, alone, lone_profile
+from ct2hair_addon.volume import BrickVolume
+from ct2hair_addon.volume.strand_signal import TYPICAL_BLUR, StrandProfile, alone, data_floor, lone_profile
 
 SPACING, BLUR = 0.4, 0.85
 PEAK = strand_peak(BLUR)
@@ -82,3 +83,21 @@ def test_another_blur_is_no_bundle(blur):
     assert alone(measured, seen, SPACING) is measured
     assert alone(measured, seen / 1.3, SPACING).peak == pytest.approx(seen / 1.3)
     assert alone(measured, 0.0, SPACING) is measured
+
+
+class Ball:
+    """A head of which every distance is known."""
+
+    def signed_distance(self, points, beyond=np.inf):
+        return np.linalg.norm(np.asarray(points, np.float64) - 20.0, axis=1) - 9.0
+
+
+@pytest.mark.parametrize("cut", [0.0, 1.5, 3.0])
+def test_the_floor_is_where_hair_begins_over_the_head_a_few_left_overs_aside(cut):
+    places = np.stack(np.meshgrid(*3 * [np.arange(80)], indexing="ij"), axis=-1).reshape(-1, 3)
+    over = Ball().signed_distance(0.5 * places).reshape(80, 80, 80)
+    hair = np.where((over > cut) & (over < 8.0), 50.0, 0.0).astype(np.float32)
+    hair[40 + 20, 40, 40] = hair[40, 40, 40 + 20] = 50.0  # on the skin
+    found = data_floor(BrickVolume.from_dense(hair, 0.5), 20.0, Ball())
+    assert found == pytest.approx(cut, abs=0.25)
+    assert data_floor(BrickVolume.from_dense(np.zeros((16, 16, 16), np.float32), 0.5), 20.0, Ball()) == 0.0
