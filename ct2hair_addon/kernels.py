@@ -55,14 +55,20 @@ def listed(commands: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(line for command in commands for line in lines[command]))
 
 
-def compile_kernel(line: str) -> None:
-    """Compile what a line like `volume.grid.gather(int32[:, ::1], float64)` says, or load it where it is compiled already."""
+def understood(line: str) -> tuple[Any, tuple[Any, ...]]:
+    """The kernel and the numba types of a line like `volume.grid.gather(int32[:, ::1], float64)`."""
     from numba import types
 
     path, _, kinds = line.removesuffix(")").partition("(")
     module, _, name = path.rpartition(".")
     kernel = getattr(importlib.import_module(f"{__package__}.{module}"), name)
-    kernel.compile(tuple(eval(f"[{kinds}]", {kind: getattr(types, kind) for kind in dir(types)})))
+    return kernel, tuple(eval(f"[{kinds}]", {kind: getattr(types, kind) for kind in dir(types)}))
+
+
+def compile_kernel(line: str) -> None:
+    """Compile what a line says, or load it where it is compiled already."""
+    kernel, kinds = understood(line)
+    kernel.compile(kinds)
 
 
 @contextmanager
@@ -114,11 +120,10 @@ def _wanted(commands: Sequence[str]) -> bool:
         return False
     if numba.config.DISABLE_JIT or numba.get_num_threads() < 2:
         return False
-    try:
-        if all(_stamp(command).read_text(encoding="utf-8") == fingerprint() for command in commands):
+    with suppress(OSError):
+        now = fingerprint()
+        if all(_stamp(command).read_text(encoding="utf-8") == now for command in commands):
             return False
-    except OSError:
-        pass
     with suppress(OSError):
         return time.time() - _beat().stat().st_mtime > SILENCE
     return True

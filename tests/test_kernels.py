@@ -6,7 +6,6 @@ import inspect
 import subprocess
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 
 import numba
@@ -16,25 +15,20 @@ from numba import types
 
 from ct2hair_addon import kernels
 
+sys.path.append(str(Path(__file__).parent))
+
+from kernels_list import record
+
 COMMANDS = ("synthesize", "reconstruct", "paper", "evaluate")
-
-
-def record(command: list[str]) -> list[str]:
-    script = Path(__file__).with_name("kernels_list.py")
-    done = subprocess.run([sys.executable, script, "--", *command], capture_output=True, encoding="utf-8", check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
 
 
 def test_every_line_names_a_kernel_and_as_many_arguments_as_it_takes():
     lines = kernels.listed(COMMANDS)
     assert len(lines) > 80 and len(set(lines)) == len(lines)
-    names = {kind: getattr(types, kind) for kind in dir(types)}
     for line in lines:
-        path, _, kinds = line.removesuffix(")").partition("(")
-        module, _, name = path.rpartition(".")
-        kernel = getattr(import_module(f"ct2hair_addon.{module}"), name)
-        inspect.signature(kernel.py_func).bind(*eval(f"[{kinds}]", dict(names)))
+        kernel, kinds = kernels.understood(line)
+        assert kinds and all(isinstance(kind, types.Type) for kind in kinds)
+        inspect.signature(kernel.py_func).bind(*kinds)
 
 
 def test_nothing_is_called_that_is_not_listed(tmp_path):
@@ -77,12 +71,16 @@ def own_cache(tmp_path, monkeypatch):
     return tmp_path
 
 
+def wait_for_the_helper(cache: Path) -> None:
+    until = time.monotonic() + 60.0
+    while not (cache / "ahead.txt").exists():
+        assert time.monotonic() < until, "the helper did not begin"
+        time.sleep(0.05)
+
+
 def test_the_helper_goes_with_the_block_and_leaves_no_trace_of_being_at_work(own_cache):
     with kernels.compiled_ahead("synthesize"):
-        until = time.monotonic() + 60.0
-        while not (own_cache / "ahead.txt").exists():
-            assert time.monotonic() < until, "the helper did not begin"
-            time.sleep(0.05)
+        wait_for_the_helper(own_cache)
         assert not kernels._wanted(["synthesize"]), "one helper is enough"
     assert not (own_cache / "ahead.txt").exists()
     assert not (own_cache / "ahead-synthesize.txt").exists(), "it was not done"
@@ -91,10 +89,7 @@ def test_the_helper_goes_with_the_block_and_leaves_no_trace_of_being_at_work(own
 
 def test_the_helper_ends_when_its_starter_is_gone(own_cache):
     helper = kernels._helper(["reconstruct"])
-    until = time.monotonic() + 60.0
-    while not (own_cache / "ahead.txt").exists():
-        assert time.monotonic() < until, "the helper did not begin"
-        time.sleep(0.05)
+    wait_for_the_helper(own_cache)
     helper.stdin.close()  # as the system does when a process ends, however it does
     try:
         assert helper.wait(timeout=10.0) != 0

@@ -79,7 +79,8 @@ def evaluate(
 ) -> dict:
     """All scores of EVALUATION.md of `result` against `truth` (one frame, mm), as plain values for JSON.
 
-    head: the registered head in the same frame, for roots and points inside (left out without one). voxels: sizes, mm.
+    head: the registered head in the same frame, for roots and points inside (left out without one); whoever asks about
+    several strands on one gives it as a `Head`, which is made once. voxels: sizes, mm.
     queries: millimetres of strand asked at most in each direction; beyond, whole strands are drawn with a fixed seed, and
     `asked` tells how many. Keys: `voxel` {size: iou, precision, recall, mse}, `strand` {"mm/degrees": precision, recall, f},
     `consistency`, `curvature` {"shortest-longest wave, mm": truth, result; 1/m, as `curvature_spectrum` gives it},

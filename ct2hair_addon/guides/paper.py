@@ -69,9 +69,8 @@ def filtered_points(direction: BrickVolume, confidence: BrickVolume, progress: P
     The same on any number of threads.
     """
     table, corners = confidence.table, confidence.brick_index.astype(np.int64) * BRICK
+    starts = offsets_from_counts(confidence.count_above(0))
     confidence, direction = confidence.bricks, direction.bricks
-    counts = np.count_nonzero(confidence.reshape(len(confidence), -1), axis=1)
-    starts = offsets_from_counts(counts)
     places, directions = np.empty((starts[-1], 3), np.float32), np.empty((starts[-1], 3), np.float32)
     sure = np.empty(starts[-1], np.uint8)
     for first in range(0, len(corners), BRICKS_A_CALL):

@@ -106,6 +106,7 @@ def smoothed(block, taps):
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def local_mean(block, reach):
     """The mean (n - 2 reach)^3 over cubes of 2 reach + 1 voxels of a block (n)^3, float32, by running sums."""
+    # voxel by voxel: whole rows and layers set at once take numba seconds longer to compile, here and wherever this is called
     width = 2 * reach + 1
     x, y, z = block.shape
     a = np.empty((x - 2 * reach, y, z), np.float32)
