@@ -99,8 +99,8 @@ def import_scan(
     knots: list[np.ndarray] = []
     bumps: list[np.ndarray] = []
     stored = solid = hair_voxels = 0
-    for low, slab, before in _slabs(scan, progress):
-        found = _look(slab, before, low, size, levels)
+    for low, slab, before, own in _slabs(scan, progress):
+        found = _look(slab, before, own, low, levels)
         knots.append(found.knots)
         bumps.append(found.bumps)
         rows = np.argwhere(found.flags > 0)
@@ -212,8 +212,9 @@ class _Found:
     hair: int
 
 
-def _slabs(scan: ScanReader | CubicScan, progress: Progress) -> Iterator[tuple[int, np.ndarray, int]]:
-    """(first slice, slab with its halo, slices of halo before the first) one after another; the next are read meanwhile."""
+def _slabs(scan: ScanReader | CubicScan, progress: Progress) -> Iterator[tuple[int, np.ndarray, int, int]]:
+    """(first slice, slab with its halo, slices of halo before the first, slices without the halo) one after another; the next
+    are read meanwhile."""
     depth = scan.shape[scan.order[0]]
     plane = 4 * scan.shape[scan.order[1]] * scan.shape[scan.order[2]]
     thick = max(SLAB_BYTES // (BLOCK * plane), 1) * BLOCK
@@ -237,18 +238,15 @@ def _slabs(scan: ScanReader | CubicScan, progress: Progress) -> Iterator[tuple[i
                     for part in (before, current, None if following is None else following[:HALO])
                     if part is not None and len(part)
                 ]
-                yield start, np.concatenate(parts) if len(parts) > 1 else parts[0], len(before)
+                yield start, np.concatenate(parts) if len(parts) > 1 else parts[0], len(before), len(current)
                 before, current = current[-HALO:].copy(), following
         finally:
             for waiting in ahead:
                 waiting.cancel()
 
 
-def _look(slab: np.ndarray, before: int, low: int, size, levels: _Levels) -> _Found:
-    """Flags, cores and knots of a slab, whose first `before` slices are halo."""
-    depth = min(slab.shape[0] - before, size[0] - low)
-    depth = min(depth, -(-depth // BLOCK) * BLOCK)
-    own = slab.shape[0] - before - (HALO if low + slab.shape[0] - before < size[0] else 0)
+def _look(slab: np.ndarray, before: int, own: int, low: int, levels: _Levels) -> _Found:
+    """Flags, cores and knots of the `own` slices of a slab, before which `before` are halo; low: the first own one in the scan."""
     shape = [-(-own // BRICK), *(-(-n // BRICK) for n in slab.shape[1:])]
     flags = np.zeros(shape, np.uint8)
     cores = np.zeros((*shape, BRICK, BRICK), np.uint16) if levels.solid < 3e38 else np.zeros((0, 0, 0, BRICK, BRICK), np.uint16)
