@@ -405,12 +405,12 @@ def _evaluate(chosen: argparse.Namespace) -> int:
 
 def _add_benchmark(commands) -> None:
     parser = add_command(commands, "benchmark", _benchmark, "measure our method and the paper's side by side on made scans")
-    parser.add_argument("name", metavar="NAME", help="quick (minutes), table1, ablation, scale or peers")
+    parser.add_argument("name", metavar="NAME", help="quick (minutes), table1, styles, heads, ablation, scale or peers")
     parser.add_argument("--out", type=Path, default=Path("out/benchmark"), metavar="DIR", help="folder for scans and results")
     parser.add_argument("--seeds", type=int, nargs="+", default=[101], metavar="N", help="seeds of hair and noise")
     parser.add_argument("--strands", type=int, default=0, metavar="N", help="strands of each scan; 0 takes the set's")
     parser.add_argument("--spacing", type=float, default=0.0, metavar="MM", help="voxel size; 0 takes the set's [mm]")
-    parser.add_argument("--snr", type=float, default=4.0, metavar="S", help="a lone strand's peak over the noise")
+    parser.add_argument("--snr", type=float, default=0.0, metavar="S", help="a strand's peak over the noise; 0 takes the set's")
     parser.add_argument("--styles", nargs="+", default=[], metavar="STYLE", help="hairstyles instead of the set's")
     parser.add_argument("--largest", type=float, default=3e6, metavar="VOXELS", help="scale: active voxels at most")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="processor threads; 0 takes all")

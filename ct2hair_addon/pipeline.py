@@ -59,6 +59,7 @@ _TYPES = (
 """What checkpoints are made of."""
 
 Value = TypeVar("Value")
+"""A stage's result: whatever it is, its `tally` says in numbers what became of what."""
 
 
 class Observer(Protocol):
@@ -168,6 +169,7 @@ class _Job:
         self._warn(registration.warnings)
         head = Head(registration.head)
         density, net_tally = remove_hairnet(wig.density, head, settings.head)
+        self.costs[-1]["tally"] |= net_tally
         wig = dataclasses.replace(wig, density=density)  # the net's voxels are needed no more
         if self.until == "head":
             return self._stop(wig, registration)
@@ -200,14 +202,7 @@ class _Job:
                 dense.strands, density, level, head, wanted, seed, progress, device=settings.run.device, peak=lone
             ),
         )
-        tallies = {
-            "scan": wig.tally,
-            "head": {**registration.tally, **net_tally},
-            "guides": guides.tally,
-            "dense": dense.tally,
-            "refinement": refined.tally,
-        }
-        return self._write(wig, registration, head, guides.strands, dense.strands, refined, tallies)
+        return self._write(wig, registration, head, guides.strands, dense.strands, refined)
 
     def _stop(self, wig: WigScan, registration: Registration | None = None, **strands: Strands) -> None:
         """Write what there is after the stage that the run was to stop at, stage.json last."""
@@ -215,19 +210,37 @@ class _Job:
             registration.head.save(self.out / "head.obj")
         for name, some in strands.items():
             some.save(self.out / f"{name}.npz")
-        known = {
-            "until": self.until,
-            "program": {"version": __version__},
-            "scan": {"file": self.scan.name, "hair_level": wig.hair_level},
+        known = {"until": self.until, **self._facts(wig, registration)}
+        beside = self.out / ".stage.part.json"
+        beside.write_text(json.dumps(known, indent=2), encoding="utf-8")
+        beside.replace(self.out / "stage.json")
+
+    def _facts(self, wig: WigScan, registration: Registration | None) -> dict[str, Any]:
+        """What report.json and stage.json say of the program, the scan, the head and the stages until now."""
+        return {
+            "program": {"name": "CT2Hair for Blender", "version": __version__, "python": platform.python_version()},
+            "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "memory_gb": machine_memory()},
+            "scan": {
+                "file": self.scan.name,
+                "spacing_mm": wig.density.spacing,
+                "hair_voxels": int(wig.density.count_above(wig.hair_level).sum()),
+                "stored_voxels": int(wig.density.bricks.size),
+                "hair_level": wig.hair_level,
+            },
             "thresholds": dataclasses.asdict(wig.thresholds),
-            "head": {} if registration is None else {"head_to_scan": np.asarray(registration.matrix, float).tolist()},
+            "head": {}
+            if registration is None
+            else {
+                "face_axis": registration.face_axis,
+                "up_axis": registration.up_axis,
+                "certainty": registration.certainty,
+                "residual_mm": registration.residual_mm,
+                "head_to_scan": np.asarray(registration.matrix, float).tolist(),
+            },
             "settings": self.settings.to_dict(),
             "stages": self.costs,
             "warnings": self.warnings,
         }
-        beside = self.out / ".stage.part.json"
-        beside.write_text(json.dumps(known, indent=2), encoding="utf-8")
-        beside.replace(self.out / "stage.json")
 
     def _import(self, progress: Progress) -> WigScan:
         reader = open_scan(self.scan, self.settings.scan, **self.raw)
@@ -315,7 +328,7 @@ class _Job:
         return Guides(amended.strands, usual, known | tally)
 
     def _write(
-        self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined, tallies
+        self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined
     ) -> Reconstruction:
         """Write the result's files, each whole or not at all."""
         self.observer.started("result", TEXTS["result"])
@@ -332,23 +345,7 @@ class _Job:
         progress(0.3, 1.0)
         lengths = hair.lengths()
         summary = {
-            "program": {"name": "CT2Hair for Blender", "version": __version__, "python": platform.python_version()},
-            "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "memory_gb": machine_memory()},
-            "scan": {
-                "file": self.scan.name,
-                "spacing_mm": wig.density.spacing,
-                "hair_voxels": int(wig.density.count_above(wig.hair_level).sum()),
-                "stored_voxels": int(wig.density.bricks.size),
-                "hair_level": wig.hair_level,
-            },
-            "thresholds": dataclasses.asdict(wig.thresholds),
-            "head": {
-                "face_axis": registration.face_axis,
-                "up_axis": registration.up_axis,
-                "certainty": registration.certainty,
-                "residual_mm": registration.residual_mm,
-                "head_to_scan": np.asarray(registration.matrix, float).tolist(),
-            },
+            **self._facts(wig, registration),
             "hair": {
                 "strands": len(hair),
                 "points": len(hair.points),
@@ -356,10 +353,7 @@ class _Job:
                 "mean_length_mm": float(lengths.mean()) if len(hair) else 0.0,
                 "mean_support": float(np.mean(hair.strand_attributes["support"])) if len(hair) else 0.0,
             },
-            "stages": [{**cost, "tally": tallies.get(cost["name"], {})} for cost in self.costs],
             "scores": refined.scores,
-            "settings": self.settings.to_dict(),
-            "warnings": self.warnings,
         }
         summary["stages"].append(
             {"name": "result", "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": False, "tally": {}}
@@ -400,7 +394,8 @@ class _Job:
             result = work(progress)
             self.checkpoints.save(name, self.keys[name], result)
             release_memory()
-        self.costs.append({"name": name, "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": resumed})
+        cost = {"name": name, "seconds": meter.seconds, "peak_memory": meter.peak_memory, "resumed": resumed}
+        self.costs.append(cost | {"tally": dict(result.tally)})
         progress(1.0, 1.0)
         return result
 

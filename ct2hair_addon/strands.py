@@ -10,6 +10,7 @@ from zipfile import BadZipFile
 
 import numba
 import numpy as np
+from scipy.spatial import cKDTree
 
 from .errors import StrandFileError
 
@@ -20,6 +21,12 @@ POINT_PREFIX = "point_"
 def normalized(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) of length 1; those of no length stay 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+def point_tree(points: np.ndarray) -> cKDTree:
+    """A tree to find the nearest of many points (M, 3) in. Strands' lie evenly: cells cut in the middle answer as soon as
+    balanced ones, and are made in half the time."""
+    return cKDTree(points, balanced_tree=False)
 
 
 @dataclass(frozen=True)

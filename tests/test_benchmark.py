@@ -1,5 +1,6 @@
 """The benchmark on tables and plots by hand, what it keeps, and a tiny set from end to end."""
 
+import dataclasses
 import json
 import xml.etree.ElementTree as xml
 
@@ -7,11 +8,11 @@ import numpy as np
 import pytest
 
 from ct2hair_addon import cli
-from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, runner
+from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, runner, sets
 from ct2hair_addon.benchmark.peers import fullest_cube
 from ct2hair_addon.benchmark.sets import _flags, methods
-from ct2hair_addon.benchmark.tables import PRINTED, Table, shown
-from ct2hair_addon.errors import SettingsError
+from ct2hair_addon.benchmark.tables import PRINTED, Table, head_table, shown
+from ct2hair_addon.errors import ScanError, SettingsError
 from ct2hair_addon.volume import BrickVolume
 
 
@@ -79,6 +80,35 @@ def test_the_fullest_cube_holds_the_most_hair():
     assert fullest_cube(BrickVolume.from_dense(volume, 1.0), 1.0, edge=2).tolist() == [2, 1, 0]
 
 
+def test_the_heads_table_has_a_row_for_a_scan_that_was_refused():
+    case = {"style": "bun", "mannequin": False, "snr": 2.0, "axes": ["+x", "-z"], "strands": 100}
+    found = {
+        "case": {**case, "mannequin": True},
+        "head": {"face_axis": "+x", "up_axis": "-z", "certainty": 0.9},
+        "registration_mm": {"median": 0.25, "p90": 0.5},
+        "thresholds": {"air": 1003.0, "noise": 6.0, "strand": 120.0},
+        "scan": {"value_of_air": 1000.0, "lone_strand_above_air": 100.0},
+        "hair_kept": 0.9,
+        "tallies": {"scan": {"knot points": 80}},
+    }
+    refused, row = head_table([{"case": case, "refused": "no hair was found"}, found]).rows
+    assert refused == ("bun", "no", 2.0, "+x -z", "refused", *[None] * 6)
+    assert row == ("bun", "yes", 2.0, "+x -z", "+x -z", 0.9, "0.25 / 0.50", 0.5, 1.2, 0.9, 0.8)
+
+
+def test_table1_takes_hairstyles_that_the_paper_has_no_row_for(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(Bench, "run", lambda bench, case, label, settings, until: asked.append((case.style, label, until)))
+    rows = {}
+    monkeypatch.setattr(sets, "_comparison", lambda options, names, results: rows.update(names) or sets.Page([], {}, [], []))
+    run_benchmark("table1", tmp_path, Options(styles=("pixie", "bob")))
+    assert asked == [("pixie", "ours", None), ("pixie", "paper", None), ("bob", "ours", None), ("bob", "paper", None)]
+    assert rows == {"short": "pixie", "bob": "bob"}
+    asked.clear()
+    run_benchmark("styles", tmp_path, Options(styles=("bob",)))
+    assert asked == [("bob", "ours", None), ("bob", "paper", "guides")]
+
+
 def test_the_page_says_how_to_get_it_again():
     assert _flags(Options(seeds=[101], styles=[])) == ""
     assert _flags(Options(seeds=[3, 4], styles=["bob"], snr=2.0, keep=True, fresh=True)) == (
@@ -92,8 +122,26 @@ def test_unknown_sets_and_styles_are_refused(tmp_path, capsys):
     with pytest.raises(SettingsError, match="unknown hairstyle 'mohawk'"):
         run_benchmark("quick", tmp_path, Options(styles=("mohawk",)))
     assert cli.main(["benchmark", "huge", "--out", str(tmp_path)]) == cli.REFUSED
-    assert "quick, table1, ablation, scale, peers" in capsys.readouterr().err
+    assert "quick, table1, styles, heads, ablation, scale, peers" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_heads_of_a_hairstyle_are_found_in_whatever_axes_it_lies_and_a_scan_without_hair_is_a_row(tmp_path, monkeypatch):
+    options = Options(styles=("bob",), strands=800, spacing=1.2, snr=10.0)
+    values = json.loads(run_benchmark("heads", tmp_path, options).with_suffix(".json").read_text(encoding="utf-8"))
+    for result, mannequin in zip(values["results"], (True, False), strict=True):
+        assert result["case"]["mannequin"] is mannequin and result["case"]["axes"] != ["-y", "+z"]
+        assert [result["head"]["face_axis"], result["head"]["up_axis"]] == result["case"]["axes"]
+        assert result["registration_mm"]["median"] < 1.5
+    assert not any("wrong way" in note for note in values["notes"]) and not (tmp_path / "runs").exists()
+
+    def refuse(*_, **__):
+        raise ScanError("no hair was found")
+
+    monkeypatch.setattr(runner, "reconstruct", refuse)
+    page = run_benchmark("heads", tmp_path, dataclasses.replace(options, seeds=[7])).read_text(encoding="utf-8")
+    assert page.count("| refused |") == page.count("refused: no hair was found") == 2
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 
 from ..evaluation import (
     centre_line_error,
@@ -28,7 +29,8 @@ from ..evaluation import (
     rooted_length,
     synthesize,
 )
-from ..head import Head, HeadMesh, load_obj, remove_hairnet, template_head
+from ..evaluation.curves import sample_curves
+from ..head import Head, HeadMesh, axis_rotation, load_obj, remove_hairnet, template_head
 from ..measure import Meter, machine_memory
 from ..orientation import field_along, orientation_field
 from ..pipeline import Silent, reconstruct
@@ -45,22 +47,29 @@ ORIENTED = 200_000
 QUERIES = 300_000
 """Millimetres of strand asked at most in each direction: a score's standard error stays under 0.2 %."""
 
+UPRIGHT = ("-y", "+z")
+"""Where the project's own heads look, and where their crown is."""
+
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scan to be made: hairstyle, strands, voxel size (mm), signal-to-noise ratio, seed of hair and noise."""
+    """A scan to be made: hairstyle, strands, voxel size (mm), signal-to-noise ratio, seed of hair and noise, whether there is
+    a mannequin, and the scan's axes that the face looks along and the crown points to."""
 
     style: str
     strands: int
     spacing: float
     snr: float = 4.0
     seed: int = 101
+    mannequin: bool = True
+    axes: tuple[str, str] = UPRIGHT
 
     @property
     def name(self) -> str:
-        return f"{self.style}-{self.strands}-{self.spacing:g}mm-snr{self.snr:g}-seed{self.seed}"
+        more = ("" if self.mannequin else "-bare") + ("" if self.axes == UPRIGHT else f"-face{self.axes[0]}-up{self.axes[1]}")
+        return f"{self.style}-{self.strands}-{self.spacing:g}mm-snr{self.snr:g}-seed{self.seed}{more}"
 
     @property
     def fill(self) -> float:
@@ -70,11 +79,12 @@ class Case:
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan on disk with what is true in it, all in its frame."""
+    """A scan on disk with what is true in it, all in its frame, and how it was made (`Synthesis.description`)."""
 
     path: Path
     truth: Strands
     head: HeadMesh
+    made: dict[str, Any]
 
 
 class Bench:
@@ -93,19 +103,23 @@ class Bench:
             path.parent.mkdir(parents=True, exist_ok=True)
             head = template_head()
             meter = Meter()
-            strands = hairstyle(case.style, head, case.strands, case.seed)
-            made = synthesize(strands, head, path, case.spacing, snr=case.snr, seed=case.seed)
+            turn = np.eye(4)
+            turn[:3, :3] = axis_rotation(*case.axes)
+            strands = hairstyle(case.style, head, case.strands, case.seed).transformed(turn)
+            made = synthesize(
+                strands, head.transformed(turn), path, case.spacing, snr=case.snr, seed=case.seed, mannequin=case.mannequin
+            )
             cost = {"seconds": meter.seconds, "peak_memory": meter.peak_memory}
             _write_json(done, made.description | {"sources": sources(), "cost": cost})
         beside = path.with_suffix("")
         truth = Strands.load(beside.with_name(f"{beside.name}.strands.npz"))
-        return Scan(path, truth, load_obj(beside.with_name(f"{beside.name}.head.obj"), align=False))
+        head = load_obj(beside.with_name(f"{beside.name}.head.obj"), align=False)
+        return Scan(path, truth, head, json.loads(done.read_text(encoding="utf-8")))
 
-    def run(self, case: Case, label: str, settings: Settings) -> dict[str, Any]:
-        """Everything measured of one method on one scan, as plain values: see `_measured`."""
-        return self.kept(
-            f"{case.name}.{label}", {"settings": settings.to_dict()}, lambda: self._measured(case, label, settings)
-        )
+    def run(self, case: Case, label: str, settings: Settings, until: str | None = None) -> dict[str, Any]:
+        """Everything measured of one method on one scan, as plain values: see `_measured`. until: as in `reconstruct`."""
+        depends = {"settings": settings.to_dict()} | ({"until": until} if until else {})
+        return self.kept(f"{case.name}.{label}", depends, lambda: self._measured(case, label, settings, until))
 
     def kept(self, name: str, depends: dict[str, Any], work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """A result from its file, or by `work`; `depends` and the engine's sources are its key."""
@@ -122,45 +136,56 @@ class Bench:
         """The wig's density of a run, the net taken out as in the run itself."""
         return remove_hairnet(load_vdb(folder / "volume.vdb"), head, settings.head)[0]
 
-    def _measured(self, case: Case, label: str, settings: Settings) -> dict[str, Any]:
+    def _measured(self, case: Case, label: str, settings: Settings, until: str | None) -> dict[str, Any]:
         scan = self.scan(case)
         # stages that two methods share are done once: the folder is that of what comes before the guides' scores
         upstream = {stage: settings.to_dict()[stage] for stage in ("scan", "head", "orientation", "guides", "run")}
         folder = self.folder / "runs" / f"{case.name}.{_digest({'sources': sources(), **upstream})[:12]}"
         self.say(f"{case.name}: reconstructing, {label}")
-        made = reconstruct(scan.path, folder, settings, observer=_Told(self.say, f"{case.name}, {label}"))
+        told = _Told(self.say, f"{case.name}, {label}")
+        made = reconstruct(scan.path, folder, settings, observer=told, until=until)
         self.say(f"{case.name}: scoring, {label}")
-        scan_report = made.report["scan"]
-        head = Head(made.head)
-        voxels = tuple(scale * case.spacing for scale in VOXELS)
-        scores = {
-            stage: evaluate(scan.truth, strands, head, voxels, QUERIES)
-            for stage, strands in (("guides", made.guides), ("dense", made.dense), ("refined", made.hair))
-        }
-        for table in scores.values():  # whatever the voxel, the first is the finer one
-            table["voxel"] = dict(zip(("fine", "coarse"), table["voxel"].values(), strict=True))
-        density = self.density(folder, head, settings)
-        level = scan_report["hair_level"]
-        own = scores["guides"]
-        own["centre_line_mm"] = centre_line_error(made.guides, scan.truth)
-        own["coverage"] = coverage(made.guides, density, level, COVERED * case.spacing)
-        for stage, strands in (("guides", made.guides), ("refined", made.hair)):
-            scores[stage]["direction"] = direction_share(strands, scan.truth, QUERIES)
-            scores[stage]["rooted_length"] = rooted_length(strands, head)
-        stages = [{name: value for name, value in stage.items() if name != "tally"} for stage in made.report["stages"]]
-        return {
+        report = json.loads((folder / ("report.json" if made else "stage.json")).read_text(encoding="utf-8"))
+        found = load_obj(folder / "head.obj", align=False)
+        stages = {} if until == "head" else {"guides": made.guides if made else Strands.load(folder / "guides.npz")}
+        if made:
+            stages |= {"dense": made.dense, "refined": made.hair}
+        head = Head(found)
+        result = {
             "case": asdict(case) | {"fill": case.fill},
             "label": label,
             "settings": settings.to_dict(),
-            "hair_voxels": scan_report["hair_voxels"],
-            "scores": scores,
-            "registration_mm": registration_error(made.head, scan.head),
-            "axes": [made.report["head"]["face_axis"], made.report["head"]["up_axis"]],
-            "orientation": orientation_scores(density, level, settings, scan.truth, made.guides),
-            "stages": stages,
-            "tallies": {stage["name"]: stage["tally"] for stage in made.report["stages"]},
+            "hair_voxels": report["scan"]["hair_voxels"],
+            "thresholds": report["thresholds"],
+            "scores": self._scores(case, scan.truth, stages, head),
+            "scan": {name: scan.made[name] for name in ("value_of_air", "lone_strand_above_air")},
+            "registration_mm": registration_error(found, scan.head),
+            "head": {name: report["head"][name] for name in ("face_axis", "up_axis", "certainty", "residual_mm")},
+            "stages": [{name: value for name, value in stage.items() if name != "tally"} for stage in report["stages"]],
+            "tallies": {stage["name"]: stage["tally"] for stage in report["stages"]},
             "load": self.load,
         }
+        density, level = self.density(folder, head, settings), report["scan"]["hair_level"]
+        if "guides" in stages:
+            result["scores"]["guides"]["coverage"] = coverage(stages["guides"], density, level, COVERED * case.spacing)
+            result["orientation"] = orientation_scores(density, level, settings, scan.truth, stages["guides"])
+        places = sample_curves(scan.truth, 1.0).points
+        result["hair_kept"] = float(np.mean(density.sample(places) != 0.0))  # what is cleared or not stored is 0
+        return result
+
+    def _scores(self, case: Case, truth: Strands, stages: dict[str, Strands], head: Head) -> dict[str, dict[str, Any]]:
+        """The strands' own scores, stage by stage."""
+        voxels = tuple(scale * case.spacing for scale in VOXELS)
+        scores = {stage: evaluate(truth, strands, head, voxels, QUERIES) for stage, strands in stages.items()}
+        for stage, table in scores.items():
+            # whatever the voxel, the first is the finer one
+            table["voxel"] = dict(zip(("fine", "coarse"), table["voxel"].values(), strict=True))
+            if stage != "dense":
+                table["direction"] = direction_share(stages[stage], truth, QUERIES)
+                table["rooted_length"] = rooted_length(stages[stage], head)
+        if "guides" in scores:
+            scores["guides"]["centre_line_mm"] = centre_line_error(stages["guides"], truth)
+        return scores
 
     def clear_runs(self) -> None:
         """Delete the runs' folders, gigabytes of checkpoints, unless they are to be kept."""

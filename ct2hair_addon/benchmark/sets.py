@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import platform
 import shlex
@@ -13,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..errors import SettingsError
+from ..errors import CT2HairError, SettingsError
 from ..evaluation import STYLES
+from ..head import orientations
 from ..kernels import compiled_ahead
 from ..settings import Settings, parameters
 from . import peers as peers_
 from . import plots
 from .runner import Bench, Case, Say, machine, sources
-from .tables import Table, cost_table, shown, stage_table, strand_table, table1, voxel_row
+from .tables import Table, cost_table, head_table, shown, stage_table, strand_table, table1, voxel_row
 
 ROWS = {
     "short": ("pixie", "mop_top"),
@@ -31,6 +33,8 @@ ROWS = {
 """Rows of the paper's Table 1 and the hairstyles that stand for them, the first that there is."""
 FULL = (8000, 0.4)
 """Strands and voxel size (mm) of a scan as hard as the paper's (fill 1280), 64 times smaller."""
+HALF = (2000, 0.8)
+"""As hard, with an eighth of the voxels."""
 SMALL = (1500, 0.9)
 """The same difficulty (fill 1215) with a tenth of the voxels."""
 SMALLEST = (800, 1.2)
@@ -40,6 +44,8 @@ SIZES = (300, 600, 1200, 2400, 4800, 8000, 16000, 32000, 60000)
 """Strands of the scans of `scale`, at FILL; as many are run as stay under the largest number of voxels."""
 VOXELS_A_STRAND = 0.9e3
 """Active voxels a strand at 8,000 strands and 0.4 mm, to guess a scan's size before it is made; it grows with their root."""
+SNR, SNRS = 4.0, (2.0, 10.0)
+"""The scans' signal-to-noise ratio, and those of `heads`."""
 PAPER_STRANDS = 100_000
 
 
@@ -47,14 +53,14 @@ PAPER_STRANDS = 100_000
 class Options:
     """What of a set can be changed.
 
-    strands, spacing (mm): of each scan; 0 takes the set's own, as no styles do. largest: active voxels of the largest scan of
-    `scale`. keep: keep the runs' folders. fresh: forget results of earlier calls.
+    strands, spacing (mm), snr: of each scan; 0 takes the set's own, as no styles do. largest: active voxels of the largest scan
+    of `scale`. keep: keep the runs' folders. fresh: forget results of earlier calls.
     """
 
     seeds: Sequence[int] = (101,)
     strands: int = 0
     spacing: float = 0.0
-    snr: float = 4.0
+    snr: float = 0.0
     styles: Sequence[str] = ()
     largest: float = 3e6
     threads: int = 0
@@ -108,17 +114,33 @@ def methods(case: Case) -> dict[str, Settings]:
 
 def _cases(options: Options, styles: Sequence[str], size: tuple[int, float]) -> list[Case]:
     strands, spacing = options.strands or size[0], options.spacing or size[1]
-    return [Case(style, strands, spacing, options.snr, seed) for seed in options.seeds for style in styles]
+    return [Case(style, strands, spacing, options.snr or SNR, seed) for seed in options.seeds for style in styles]
 
 
 def _threaded(settings: Settings, options: Options) -> Settings:
     return settings.changed({"run.threads": options.threads}) if options.threads else settings
 
 
+def _tried(bench: Bench, case: Case, label: str, settings: Settings, until: str | None) -> dict[str, Any]:
+    """`Bench.run`, or what the scan was refused for: a scan that a method can't do is a result as well."""
+    try:
+        return bench.run(case, label, settings, until)
+    except CT2HairError as error:
+        return {"case": dataclasses.asdict(case) | {"fill": case.fill}, "label": label, "refused": str(error)}
+
+
 def _compared(
-    bench: Bench, options: Options, names: dict[str, str], size: tuple[int, float], with_paper: Callable[[Case], bool]
+    bench: Bench,
+    options: Options,
+    names: dict[str, str],
+    size: tuple[int, float],
+    with_paper: Callable[[Case], bool] = lambda case: True,
+    paper_until: str | None = None,
 ) -> Page:
-    """Ours and, where wanted, the paper's on each style: Table 1, strand scores, the stages' own, and what they cost."""
+    """Ours and, where wanted, the paper's on each style: Table 1, strand scores, the stages' own, and what they cost.
+
+    paper_until: the stage after which the paper's is stopped.
+    """
     results: dict[tuple[str, str], dict[str, Any]] = {}
     by_style = {style: row for row, style in names.items()}
     for case in _cases(options, list(names.values()), size):
@@ -126,15 +148,24 @@ def _compared(
             row = by_style[case.style]
             key = row if len(options.seeds) == 1 else f"{row}, seed {case.seed}"
             if method != "paper" or with_paper(case):
-                results[key, method] = bench.run(case, method, _threaded(settings, options))
+                until = paper_until if method == "paper" else None
+                results[key, method] = _tried(bench, case, method, _threaded(settings, options), until)
         bench.clear_runs()
+    return _comparison(options, names, results)
+
+
+def _comparison(options: Options, names: dict[str, str], results: dict[tuple[str, str], dict[str, Any]]) -> Page:
+    """The page of results by (row, method); names: row -> hairstyle."""
+    notes = _notes(options, results.values())
+    results = {key: result for key, result in results.items() if "refused" not in result}
     shown_names = {row: names[row.split(",")[0]] for row, _ in results}
     groups = list(shown_names)
 
     def series(stages: Sequence[str], score: Callable[[dict[str, Any]], float]) -> dict[str, list[float | None]]:
+        known = {key: result["scores"] for key, result in results.items()}
         return {
             f"{method}, {stage}": [
-                score(results[row, method]["scores"][stage]) if (row, method) in results else None for row in groups
+                score(known[row, method][stage]) if stage in known.get((row, method), {}) else None for row in groups
             ]
             for method in ("paper", "ours")
             for stage in stages
@@ -142,12 +173,12 @@ def _compared(
 
     iou = series(("dense", "refined"), lambda scores: scores["voxel"]["fine"]["iou"])
     f_scores = series(("guides", "refined"), lambda scores: scores["strand"]["1/10"]["f"])
-    pictures = {
-        "iou": plots.bars("IoU, voxels of 1.25 times the scan's", groups, iou),
-        "strands": plots.bars("F at 1 mm / 10 degrees", groups, f_scores),
-    }
+    pictures = {}
+    if groups:
+        pictures["iou"] = plots.bars("IoU, voxels of 1.25 times the scan's", groups, iou)
+        pictures["strands"] = plots.bars("F at 1 mm / 10 degrees", groups, f_scores)
     tables = [table1(results, shown_names), strand_table(results), stage_table(results), cost_table(results)]
-    return Page(tables, pictures, _notes(options, results.values()), list(results.values()))
+    return Page(tables, pictures, notes, list(results.values()))
 
 
 def quick(bench: Bench, options: Options) -> Page:
@@ -161,12 +192,33 @@ def paper_table(bench: Bench, options: Options) -> Page:
     """The paper's Table 1 on scans as hard as its own."""
     names = {row: next(style for style in styles if style in STYLES) for row, styles in ROWS.items()}
     if options.styles:
-        names = {row: style for row, style in names.items() if style in options.styles} or {s: s for s in options.styles}
-    page = _compared(bench, options, names, FULL, lambda case: True)
+        rows = {style: row for row, style in names.items()}
+        names = {rows.get(style, style): style for style in options.styles}
+    page = _compared(bench, options, names, FULL)
     missing = [f"{row} ({styles[0]} by {names[row]})" for row, styles in ROWS.items() if names.get(row, styles[0]) != styles[0]]
     if missing:
         page.notes.append(f"Hairstyles that aren't there yet are stood in for: {', '.join(missing)}.")
     return page
+
+
+def every_style(bench: Bench, options: Options) -> Page:
+    """All hairstyles by ours, and the paper's guides beside ours: its optimisation of all of them takes a day."""
+    return _compared(bench, options, {style: style for style in options.styles or STYLES}, FULL, paper_until="guides")
+
+
+def heads(bench: Bench, options: Options) -> Page:
+    """Thresholds, scalp and the head's place alone: each hairstyle turned another way, with and without a mannequin, in much
+    noise and in little."""
+    turns = itertools.cycle(orientations()[::7] + orientations()[3::7])
+    strands, spacing = options.strands or HALF[0], options.spacing or HALF[1]
+    results = []
+    for seed in options.seeds:
+        for style, mannequin in itertools.product(options.styles or STYLES, (True, False)):
+            for snr in (options.snr,) if options.snr else SNRS:
+                case = Case(style, strands, spacing, snr, seed, mannequin, next(turns))
+                results.append(_tried(bench, case, "head", _threaded(Settings(), options), "head"))
+            bench.clear_runs()
+    return Page([head_table(results)], {}, _notes(options, results), results)
 
 
 def ablation(bench: Bench, options: Options) -> Page:
@@ -260,7 +312,7 @@ def scale(bench: Bench, options: Options) -> Page:
         if VOXELS_A_STRAND * strands * (strands / FULL[0]) ** 0.5 > options.largest:
             left_out.append(strands)
             continue
-        case = Case(style, strands, round((FILL / strands) ** 0.5, 3), options.snr, options.seeds[0])
+        case = Case(style, strands, round((FILL / strands) ** 0.5, 3), options.snr or SNR, options.seeds[0])
         result = bench.run(case, "ours", _threaded(methods(case)["ours"], options))
         results[f"{strands} strands, {case.spacing:g} mm", "ours"] = result
         bench.clear_runs()
@@ -325,6 +377,8 @@ def peers(bench: Bench, options: Options) -> Page:
 SETS: dict[str, Callable[[Bench, Options], Page]] = {
     "quick": quick,
     "table1": paper_table,
+    "styles": every_style,
+    "heads": heads,
     "ablation": ablation,
     "scale": scale,
     "peers": peers,
@@ -335,8 +389,13 @@ SETS: dict[str, Callable[[Bench, Options], Page]] = {
 def _notes(options: Options, results) -> list[str]:
     """What a reader of the numbers has to know."""
     results = list(results)
-    notes = []
-    wrong = [result["case"]["style"] for result in results if result["axes"] != ["-y", "+z"]]
+    notes = [
+        f"{result['case']['style']}, {result['label']}, refused: {result['refused']}"
+        for result in results
+        if "refused" in result
+    ]
+    found = [(r["case"], [r["head"]["face_axis"], r["head"]["up_axis"]]) for r in results if "head" in r]
+    wrong = [case["style"] for case, axes in found if axes != list(case["axes"])]
     if wrong:
         notes.append(f"The head was found facing the wrong way on: {', '.join(sorted(set(wrong)))}.")
     cores = machine()["cores"] or 1

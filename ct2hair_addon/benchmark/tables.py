@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -69,8 +69,7 @@ def table1(results: dict[tuple[str, str], dict[str, Any]], names: dict[str, str]
             table.rows.append((title, "printed, with", *with_, None))
         for (known, method), result in results.items():
             if known == row:
-                for stage in ("guides", "dense", "refined"):
-                    scores = result["scores"][stage]
+                for stage, scores in result["scores"].items():
                     table.rows.append((title, f"{method}: {stage}", *voxel_row(scores), scores["voxel"]["coarse"]["iou"]))
     return table
 
@@ -83,8 +82,7 @@ def strand_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
         note="Bends: the curvature's root mean square over the truth's, in waves of 10 to 25, 25 to 60 and 60 to 150 mm.",
     )
     for (row, method), result in results.items():
-        for stage in ("guides", "dense", "refined"):
-            scores = result["scores"][stage]
+        for stage, scores in result["scores"].items():
             f = [scores["strand"][name]["f"] for name in ("0.5/10", "1/10", "2/20", "4/40")]
             count = scores["counts"]["result_strands"]
             bends = " / ".join(f"{rms['result'] / max(rms['truth'], 1e-9):.2f}" for rms in scores["curvature"].values())
@@ -113,6 +111,35 @@ def stage_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
                 f"{off['traced']['median']:.1f} / {off['traced']['p90']:.1f}",
                 guides["centre_line_mm"]["median"] / result["case"]["spacing"], guides["coverage"],
                 guides["direction"]["right"], guides["rooted_length"], guides["counts"]["result_strands"],
+            )
+        )  # fmt: skip
+    return table
+
+
+def head_table(results: Iterable[dict[str, Any]]) -> Table:
+    """What is found of scans before any strand is: thresholds, axes, scalp."""
+    table = Table(
+        "Thresholds, scalp and head",
+        (
+            "style", "mannequin", "SNR", "face, up", "found", "certainty", "scalp off (median / 90 %, mm)",
+            "air off (of the noise)", "lone strand over the true one", "hair kept", "knots seen",
+        ),
+        note="Hair kept: of the true strands' length, what neither went with the mannequin and the net nor passed for air. "
+        "Knots seen, of the strands: two that lie closer than the scan shows are one.",
+    )  # fmt: skip
+    for result in results:
+        case = result["case"]
+        row = (case["style"], "yes" if case["mannequin"] else "no", case["snr"], " ".join(case["axes"]))
+        if "refused" in result:
+            table.rows.append((*row, "refused", *[None] * 6))
+            continue
+        head, off, found, true = result["head"], result["registration_mm"], result["thresholds"], result["scan"]
+        table.rows.append(
+            (
+                *row, f"{head['face_axis']} {head['up_axis']}", head["certainty"], f"{off['median']:.2f} / {off['p90']:.2f}",
+                (found["air"] - true["value_of_air"]) / max(found["noise"], 1e-9),
+                found["strand"] / true["lone_strand_above_air"], result["hair_kept"],
+                result["tallies"]["scan"]["knot points"] / case["strands"],
             )
         )  # fmt: skip
     return table

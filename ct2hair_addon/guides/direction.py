@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.spatial import cKDTree
 
 from ..head import Head
 from ..settings import GuideSettings
-from ..strands import Strands, normalized
+from ..strands import Strands, normalized, point_tree
 
 TANGENT_SPAN = 3.0
 """mm; the length at an end over which its direction is taken: a voxel or two would be noise."""
@@ -75,7 +74,7 @@ def signs(
     """
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
-    tree = cKDTree(samples.points)
+    tree = point_tree(samples.points)
     reach = settings.neighbour_radius
     rows, columns, weights = [], [], []
     size = 65536

@@ -45,12 +45,12 @@ def lead_to_free_knots(
     bool which have one).
     """
     knots, tied = np.zeros((len(strands), 3)), np.zeros(len(strands), bool)
-    if not len(rest) or not len(free):
-        return strands, knots, tied
-    way, counts = _ways(strands, made, rest, head, progress)
-    offsets = offsets_from_counts(counts)
     followed = strands.arc_lengths()[strands.offsets[:-1] + made][made > 0]
     farthest = AS_FAR * np.median(followed) if len(followed) else 0.0
+    if not len(rest) or not len(free) or farthest < LEAVING:
+        return strands, knots, tied
+    way, counts = _ways(strands, made, rest, head, farthest, progress)
+    offsets = offsets_from_counts(counts)
     tree = cKDTree(free)
     parts = []
     for low in range(0, len(rest), CHUNK):
@@ -82,9 +82,11 @@ def _passed(way, counts, tree, head, farthest):
     return owner[step[order]], knot[order], cost[order], step[order]
 
 
-def _ways(strands: Strands, made: np.ndarray, rest: np.ndarray, head: Head, progress: Progress):
-    """(points (S, 3) float32, counts (R,)): the ways back from first traced points; steps of WALK_STEP at their ends."""
-    path, taken, _ = walked_back(strands, rest, head, LOW, progress, glide=True)
+def _ways(strands: Strands, made: np.ndarray, rest: np.ndarray, head: Head, farthest: float, progress: Progress):
+    """(points (S, 3) float32, counts (R,)): the ways back from first traced points, `farthest` mm and more; steps of WALK_STEP
+    at their ends."""
+    # steps that glide over the head may be shorter
+    path, taken, _ = walked_back(strands, rest, head, LOW, progress, glide=True, longest=1.5 * farthest)
     own = made[rest]
     counts = own + 1 + taken
     offsets = offsets_from_counts(counts)

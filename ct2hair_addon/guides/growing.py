@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
-from ..strands import Strands, normalized, offsets_from_counts
+from ..strands import Strands, normalized, offsets_from_counts, point_tree
 from .direction import TOUCH, end_tangents
 
 REACHES = (1.0, 2.0, 4.0)
@@ -54,7 +54,7 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
     for reach in REACHES:
         for _ in range(MOST_ROUNDS):
             if len(fresh):
-                forest.append((cKDTree(current.points), current, current.tangents()))
+                forest.append((point_tree(current.points), current, current.tangents()))
             waiting = np.flatnonzero(~reached)
             if not len(waiting) or not forest:
                 break
@@ -112,7 +112,7 @@ def course_around(strands: Strands, places: np.ndarray, own: np.ndarray) -> np.n
     the directions `own` (N, 3) left out; `own` itself counts little, unless there is no other."""
     hair = strands.resampled_by_step(COURSE_STEP)
     tangents = hair.tangents().astype(np.float64)
-    distance, near = cKDTree(hair.points).query(places, k=COURSE_POINTS, distance_upper_bound=COURSE_REACH, workers=-1)
+    distance, near = point_tree(hair.points).query(places, k=COURSE_POINTS, distance_upper_bound=COURSE_REACH, workers=-1)
     found = np.isfinite(distance)
     tangents = tangents[np.where(found, near, 0)]
     along = found & (np.einsum("nkc,nc->nk", tangents, own) > 0.0)
@@ -147,20 +147,26 @@ def follow_to_scalp(
 
 
 def walked_back(
-    strands: Strands, walkers: np.ndarray, head: Head, low: float, progress: Progress = silent, glide: bool = False
+    strands: Strands,
+    walkers: np.ndarray,
+    head: Head,
+    low: float,
+    progress: Progress = silent,
+    glide: bool = False,
+    longest: float = LONGEST_WALK,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The steps of the strands `walkers` (W,) back from their roots, until they are `low` (mm) or have no hair around; with
-    `glide` they go on over the head there, as low as that.
+    """The steps of the strands `walkers` (W,) back from their roots, until they are `low` (mm), have no hair around or came
+    `longest` mm; with `glide` they go on over the head where they are low, as low as that.
 
     Returns (path (S + 1, W, 3) float32 mm, the root first; (W,) int64 steps taken; (W,) mm over the head at the last of them).
     """
-    steps = round(LONGEST_WALK / WALK_STEP)
+    steps = round(min(longest, LONGEST_WALK) / WALK_STEP)
     path = np.zeros((steps + 1, len(walkers), 3), np.float32)
     path[0] = strands.roots[walkers]
     taken = np.zeros(len(walkers), np.int64)
     height = np.array(head.signed_distance(path[0]))
     hair = strands.resampled_by_step(2.0 * WALK_STEP)
-    tree, index, tangents = cKDTree(hair.points), hair.strand_index, hair.tangents().astype(np.float64)
+    tree, index, tangents = point_tree(hair.points), hair.strand_index, hair.tangents().astype(np.float64)
     own, _ = end_tangents(strands)
     way = course_around(strands, path[0], own[walkers])
     going = np.arange(len(walkers))

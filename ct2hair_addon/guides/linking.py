@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
-from ..strands import Strands, offsets_from_counts
+from ..strands import Strands, offsets_from_counts, point_tree
 from ..volume.grid import BrickVolume
 from .sampling import density_at
 
@@ -112,7 +112,7 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
         return Pieces(lines, np.zeros(0, np.int64), np.zeros(0, np.int64))
     tangents, index = lines.tangents(), lines.strand_index
     ends = np.concatenate([lines.offsets[:-1], lines.offsets[1:] - 1])
-    tree = cKDTree(lines.points)
+    tree = point_tree(lines.points)
     near = tree.query(lines.points[ends], k=24, distance_upper_bound=CONTACT * voxel, workers=-1)[1]
     row, column = np.nonzero(near < len(lines.points))
     place, end = near[row, column], ends[row]

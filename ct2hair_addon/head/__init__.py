@@ -7,7 +7,7 @@ from .landmarks import fit_landmarks, scalp_landmarks
 from .marking import mark_scalp
 from .mesh import HeadMesh
 from .obj import load_obj
-from .registration import Registration, fit_to_roots, register_head
+from .registration import Registration, axis_rotation, fit_to_roots, orientations, register_head
 from .scalp_surface import ScalpSurface, scalp_surface
 from .surface import Head, ScalpPoints
 
@@ -19,11 +19,13 @@ __all__ = [
     "Registration",
     "ScalpPoints",
     "ScalpSurface",
+    "axis_rotation",
     "distortion",
     "fit_landmarks",
     "fit_to_roots",
     "load_obj",
     "mark_scalp",
+    "orientations",
     "register_head",
     "remove_hairnet",
     "scalp_landmarks",

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
-from ..strands import Strands, offsets_from_counts
+from ..strands import Strands, offsets_from_counts, point_tree
 from .curves import control_points, even_lines
 from .motion import BAND, solve_bands, third
 
@@ -55,7 +54,7 @@ def exchange_tips(
     following, previous, owner = _linked(len(lines), starts)
     places = np.flatnonzero(np.repeat(may, np.diff(starts)))
     known = places[::KNOWN_EVERY]
-    tree = cKDTree(lines[known])
+    tree = point_tree(lines[known])
     places = places[::ASKED_EVERY]
     asked, left = np.ones(len(lines), bool), np.zeros((0, 2), np.int64)
     made = 0

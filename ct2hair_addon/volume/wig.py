@@ -246,7 +246,7 @@ def _slabs(scan: ScanReader | CubicScan, progress: Progress) -> Iterator[tuple[i
 
 
 def _look(slab: np.ndarray, before: int, own: int, low: int, levels: _Levels) -> _Found:
-    """Flags, cores and knots of the `own` slices of a slab, before which `before` are halo; low: the first own one in the scan."""
+    """Flags, cores and knots of a slab's `own` slices, after `before` of halo; low: the first own one's number in the scan."""
     shape = [-(-own // BRICK), *(-(-n // BRICK) for n in slab.shape[1:])]
     flags = np.zeros(shape, np.uint8)
     cores = np.zeros((*shape, BRICK, BRICK), np.uint16) if levels.solid < 3e38 else np.zeros((0, 0, 0, BRICK, BRICK), np.uint16)
