@@ -36,6 +36,7 @@ from .structure import (
     local_mean,
     ripple,
     smoothed,
+    top_around,
 )
 from .thresholds import BELOW_NOISE, BLOCK, SOLID_VOLUME, Thresholds
 
@@ -131,10 +132,10 @@ def import_scan(
         cleared = bodies.clear(index, bricks)
         # what is stored for its dense voxels alone stays where that was hair after all
         keep |= (core_table[tuple(index.T)] >= 0) & ~bodies.lie_in(index)
-        bumps = [found[bodies.near(found)] for found in bumps]
+        bumps = [found[bodies.near(np.rint(found).astype(np.int64))] for found in bumps]
         if sum(len(found) for found in bumps) >= ENOUGH_BUMPS:
             # knots on the mannequin's skin are sure; blobs elsewhere are hair that crosses
-            knots = [np.zeros((0, 3), np.int32)]
+            knots = [np.zeros((0, 3), np.float32)]
     else:
         keep[:] = True
     knots += bumps
@@ -201,7 +202,8 @@ class _Found:
     """What a slab holds.
 
     flags: (bricks) uint8, 1 strand-like, 2 dense core. cores, flats: uint16 rows of core voxels and of those that are flat.
-    knots, bumps: (K, 3) voxels of blobs in the hair and on the mannequin's skin. hair: strand-like voxels.
+    knots, bumps: (K, 3) places in voxels, between them too, of blobs in the hair and on the mannequin's skin. hair: strand-like
+    voxels.
     """
 
     flags: np.ndarray
@@ -252,7 +254,7 @@ def _look(slab: np.ndarray, before: int, own: int, low: int, levels: _Levels) ->
     cores = np.zeros((*shape, BRICK, BRICK), np.uint16) if levels.solid < 3e38 else np.zeros((0, 0, 0, BRICK, BRICK), np.uint16)
     flats = np.zeros_like(cores)
     corners = np.stack(np.meshgrid(*(np.arange(0, n, BLOCK // BRICK) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    knots = np.empty((len(corners), MOST_KNOTS, 3), np.int32)
+    knots = np.empty((len(corners), MOST_KNOTS, 3), np.float32)
     counts = np.zeros((len(corners), 3), np.int64)
     _mark(
         slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, levels.flat, TAPS, DIRECTIONS,
@@ -335,11 +337,10 @@ def _mark(
                 continue
             if low[0] + i >= own or counts[n, 0] == MOST_KNOTS:
                 continue
-            places[n, counts[n, 0], 0], places[n, counts[n, 0], 1], places[n, counts[n, 0], 2] = (
-                low[0] + i,
-                low[1] + j,
-                low[2] + k,
-            )
+            at, margin = counts[n, 0], HALO - 3
+            x, y, z = top_around(smooth, i + margin, j + margin, k + margin)
+            x, y, z = low[0] + x - margin, low[1] + y - margin, low[2] + z - margin
+            places[n, at, 0], places[n, at, 1], places[n, at, 2] = x, y, z
             counts[n, 0] += 1
 
 
@@ -368,7 +369,8 @@ def _bumps(smooth, mean, near, reach, edge, solid, least, low, own, places):
                             if height[i + a, j + b, k + c] > here:
                                 highest = False
                 if highest:
-                    places[count, 0], places[count, 1], places[count, 2] = low[0] + i - 1, low[1] + j - 1, low[2] + k - 1
+                    x, y, z = top_around(height, i, j, k)
+                    places[count, 0], places[count, 1], places[count, 2] = low[0] + x - 1, low[1] + y - 1, low[2] + z - 1
                     count += 1
     return count
 

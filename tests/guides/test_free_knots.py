@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.guides.free_knots import AS_FAR, LEAVING, lead_to_free_knots
-from ct2hair_addon.guides.growing import WALK_STEP, follow_to_scalp
+from ct2hair_addon.guides.growing import WALK_STEP, follow_to_scalp, walked_back
 from ct2hair_addon.guides.roots import lead_into_scalp
 from ct2hair_addon.head import Head
 from ct2hair_addon.strands import Strands
@@ -82,6 +82,14 @@ def test_where_hair_stands_up_no_knot_is_looked_for_far_back(ball, stream):
     np.testing.assert_array_equal(led.points, strands.points)
     led, _, tied = lead_to_free_knots(strands, made, rest[:0], knots, ball)
     assert not tied.any() and led is strands
+
+
+def test_a_way_back_is_no_longer_than_asked_and_otherwise_the_same(ball, stream):
+    strands, _, rest, _ = stream
+    whole, taken, _ = walked_back(strands, rest, ball, 0.8, glide=True)
+    path, fewer, _ = walked_back(strands, rest, ball, 0.8, glide=True, longest=8.0)
+    assert taken.min() > 8.0 / WALK_STEP and fewer.tolist() == [round(8.0 / WALK_STEP)] * len(rest)
+    np.testing.assert_array_equal(path, whole[: len(path)])
 
 
 def test_strands_followed_past_their_knots_come_back_to_them(ball, stream):
