@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ import pytest
 from numba import types
 
 from ct2hair_addon import kernels
+from ct2hair_addon.cache import kernel_folder
 
 sys.path.append(str(Path(__file__).parent))
 
@@ -113,3 +115,24 @@ def test_a_helper_that_cannot_start_is_no_error(own_cache, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("inside Blender kernels lie elsewhere"))
     with kernels.compiled_ahead("evaluate"):
         pass
+
+
+def test_kernels_of_other_sources_lie_elsewhere_and_go_when_nobody_used_them_for_long(tmp_path, monkeypatch):
+    monkeypatch.setenv("CT2HAIR_CACHE", str(tmp_path / "cache"))
+    sources = tmp_path / "engine"
+    (sources / "volume").mkdir(parents=True)
+    (sources / "volume" / "grid.py").write_text("@numba.njit(cache=True)")
+    (sources / "report.py").write_text("no kernels")
+    first = kernel_folder("engine", sources)
+    first.mkdir(parents=True)
+    (sources / "report.py").write_text("none still")
+    assert kernel_folder("engine", sources) == first
+    (sources / "volume" / "grid.py").write_text("@numba.njit(cache=True, parallel=True)")
+    second = kernel_folder("engine", sources)
+    assert second != first and second.parent == first.parent == tmp_path / "cache" / "kernels" / "engine"
+    assert first.is_dir(), "somebody may go back to it"
+    second.mkdir()
+    for folder in (first, second):
+        os.utime(folder, (0, 0))
+    assert kernel_folder("engine", sources) == second
+    assert second.is_dir() and not first.exists()
