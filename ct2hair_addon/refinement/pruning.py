@@ -121,7 +121,7 @@ def excess_of(
 
 
 @numba.njit(cache=True, nogil=True)
-def _amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
+def amplitude(table, excess, x, y, z, tx, ty, tz, peak, seen):
     """How many strands too many are rendered at a point of a strand with unit tangent t: least squares over five reads."""
     if abs(tx) <= abs(ty) and abs(tx) <= abs(tz):
         ux, uy, uz = 0.0, tz, -ty
@@ -161,7 +161,7 @@ def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, e
                 i, j, k = int(np.floor(x + 0.5)), int(np.floor(y + 0.5)), int(np.floor(z + 0.5))
                 a = 1.0  # where nothing is stored, nothing is rendered: the strand is one too many
                 if not np.isnan(voxel(table, excess, np.float32(np.nan), i, j, k)):
-                    a = _amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
+                    a = amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
                 total += shown * length * (0.5 - min(max(a, -1.0), 2.0))
                 if bare > 0.0 and trilinear(table, scan, np.float32(0.0), x, y, z) < bare:
                     total -= shown * length * BARE_COST

@@ -17,6 +17,7 @@ from .curves import EVEN, SEGMENT_LENGTH, control_points, even_lines, polylines
 from .exchange import exchange_tips
 from .fit import FIRST_SMOOTH, fit_to_volume
 from .pruning import prune
+from .tips import settle_tips
 
 MISPLACED = 2.0
 """voxel; strands may be off by so much before they are fitted, and are not held to be wrong for it."""
@@ -106,10 +107,13 @@ def refine(
                 density,
                 profile,
                 boundary,
-                part(progress, 0.85, 0.9),
+                part(progress, 0.85, 0.88),
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
+        if settings.method == "volume" and final:
+            points, moved = settle_tips(points, offsets, boundary.look(points), density, profile, part(progress, 0.88, 0.9))
+            tally["tips moved out"], tally["tips moved in"] = int((moved > 0.0).sum()), int((moved < 0.0).sum())
     if not final:
         progress(1.0, 1.0)
         return Refined(Strands(*even_lines(points, offsets, EVEN * density.spacing), kept.strand_attributes), tally, {})
