@@ -209,7 +209,8 @@ def every_style(bench: Bench, options: Options) -> Page:
 def heads(bench: Bench, options: Options) -> Page:
     """Thresholds, scalp and the head's place alone: each hairstyle turned another way, with and without a mannequin, in much
     noise and in little."""
-    turns = itertools.cycle(orientations()[::7] + orientations()[3::7])
+    every = orientations()
+    turns = itertools.cycle(every[7 * n % len(every)] for n in range(len(every)))
     strands, spacing = options.strands or HALF[0], options.spacing or HALF[1]
     results = []
     for seed in options.seeds:
