@@ -111,8 +111,10 @@ def refine(
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
-        if settings.method == "volume" and final:
-            points, moved = settle_tips(points, offsets, boundary.look(points), density, profile, part(progress, 0.88, 0.9))
+        traced = kept.strand_attributes.get("guide")
+        if settings.method == "volume" and final and traced is not None and np.any(traced):
+            step = part(progress, 0.88, 0.9)
+            points, moved = settle_tips(points, offsets, boundary.look(points), density, profile, traced, step)
             tally["tips moved out"], tally["tips moved in"] = int((moved > 0.0).sum()), int((moved < 0.0).sum())
     if not final:
         progress(1.0, 1.0)

@@ -30,14 +30,15 @@ def settle_tips(
     visible: np.ndarray,
     density: BrickVolume,
     profile: StrandProfile,
+    traced: np.ndarray,
     progress: Progress = silent,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Control points (M, 3) mm with the last of each strand moved along its end to where the scan shows the hair to end, and
     by how much, (N,) mm.
 
-    offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. Of MOVES the one is taken by which what the scan shows of the
-    strand is nearest, in squares, to what its blur makes of an end there. Each strand is looked at as if the others stayed; the
-    same on any number of threads.
+    offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. traced (N,) bool: strands that were found in the scan; made-up
+    ones keep their lengths. Of MOVES the one is taken by which what the scan shows of the strand is nearest, in squares, to what
+    its blur makes of an end there. Each strand is looked at as if the others stayed; the same on any number of threads.
     """
     voxels = density.to_voxel(points)
     excess, mark = excess_of(voxels, offsets, visible, density, profile, progress=part(progress, 0.0, 0.9))
@@ -46,7 +47,8 @@ def settle_tips(
     own = ndtr(-PLACES / spread)
     moved = np.zeros(len(offsets) - 1)
     tips = np.zeros((len(moved), 3))
-    _settle(density.table, excess, voxels, offsets, visible, mark.peak, mark.seen, ends, own, moved, tips)
+    may = np.ascontiguousarray(traced, bool)
+    _settle(density.table, excess, voxels, offsets, visible, may, mark.peak, mark.seen, ends, own, moved, tips)
     out = np.array(points)
     last = offsets[1:] - 1
     out[last] += tips * density.spacing
@@ -55,12 +57,14 @@ def settle_tips(
 
 
 @numba.njit(cache=True, parallel=True)
-def _settle(table, excess, points, offsets, visible, peak, seen, ends, own, moved, tips):
-    """Fill `moved` (N,), and `tips` (N, 3) with the moves, voxels; ends (moves, places), own (places,): the share of a strand's
-    height at each place after each move, and as it is."""
+def _settle(table, excess, points, offsets, visible, may, peak, seen, ends, own, moved, tips):
+    """Fill `moved` (N,), and `tips` (N, 3) with the moves, voxels, of the strands that `may` (N,).
+
+    ends (moves, places), own (places,): the share of a strand's height at each place after each move, and as it is.
+    """
     for n in numba.prange(len(moved)):
         start, last = offsets[n], offsets[n + 1] - 1
-        if last - start < 1 or visible[last] < 1.0:
+        if not may[n] or last - start < 1 or visible[last] < 1.0:
             continue
         length = 0.0
         for m in range(start, last):

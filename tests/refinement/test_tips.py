@@ -36,9 +36,10 @@ def scan_of(*hair: Strands, noise: float = 0.0) -> BrickVolume:
     return BrickVolume(scan.table, bricks, scan.spacing, scan.origin)
 
 
-def settled(strands: Strands, scan: BrickVolume, visible: np.ndarray | None = None):
+def settled(strands: Strands, scan: BrickVolume, visible: np.ndarray | None = None, traced: list[bool] | None = None):
     shown = np.ones(len(strands.points)) if visible is None else visible
-    return settle_tips(strands.points.astype(np.float64), strands.offsets, shown, scan, PROFILE)
+    every = np.ones(len(strands), bool) if traced is None else np.array(traced)
+    return settle_tips(strands.points.astype(np.float64), strands.offsets, shown, scan, PROFILE, every)
 
 
 @pytest.mark.parametrize(("noise", "bound"), [(0.0, 0.12), (0.25, 0.25)])
@@ -65,8 +66,9 @@ def test_hair_that_others_explain_draws_no_tip():
     assert abs(moved[0]) < VOXEL, "what the other lacks is not its own"
 
 
-def test_hidden_short_and_lonely_tips_stay_as_they_are():
+def test_hidden_short_lonely_and_made_up_tips_stay_as_they_are():
     hair, strands = arcs(np.full(2, LENGTH)), arcs(np.full(2, LENGTH - 1.0))
+    assert (settled(strands, scan_of(hair), traced=[True, False])[1] > 0.0).tolist() == [True, False]
     _, moved = settled(strands, scan_of(hair), np.zeros(len(strands.points)))
     assert not moved.any()
     short = arcs(np.full(2, 3.0))
