@@ -37,8 +37,8 @@ def settle_tips(
     by how much, (N,) mm.
 
     offsets (N + 1,), visible (M,) 0..1 as in `splat.render`. traced (N,) bool: strands that were found in the scan; made-up
-    ones keep their lengths. Of MOVES the one is taken by which what the scan shows of the strand is nearest, in squares, to what
-    its blur makes of an end there. Each strand is looked at as if the others stayed; the same on any number of threads.
+    ones keep their lengths. Of MOVES the one is taken by which what the scan shows of the strand is nearest, in squares, to
+    what its blur makes of an end there. Each is looked at as if the others stayed; the same on any number of threads.
     """
     voxels = density.to_voxel(points)
     excess, mark = excess_of(voxels, offsets, visible, density, profile, progress=part(progress, 0.0, 0.9))
