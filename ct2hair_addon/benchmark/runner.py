@@ -23,13 +23,13 @@ from ..evaluation import (
     coverage,
     direction_share,
     evaluate,
+    hair_kept,
     hairstyle,
     orientation_error,
     registration_error,
     rooted_length,
     synthesize,
 )
-from ..evaluation.curves import sample_curves
 from ..head import Head, HeadMesh, axis_rotation, load_obj, remove_hairnet, template_head
 from ..measure import Meter, machine_memory
 from ..orientation import field_along, orientation_field
@@ -151,11 +151,13 @@ class Bench:
         if made:
             stages |= {"dense": made.dense, "refined": made.hair}
         head = Head(found)
+        density, level = self.density(folder, head, settings), report["scan"]["hair_level"]
         result = {
             "case": asdict(case) | {"fill": case.fill},
             "label": label,
             "settings": settings.to_dict(),
             "hair_voxels": report["scan"]["hair_voxels"],
+            "hair_kept": hair_kept(scan.truth, density),
             "thresholds": report["thresholds"],
             "scores": self._scores(case, scan.truth, stages, head),
             "scan": {name: scan.made[name] for name in ("value_of_air", "lone_strand_above_air")},
@@ -165,12 +167,9 @@ class Bench:
             "tallies": {stage["name"]: stage["tally"] for stage in report["stages"]},
             "load": self.load,
         }
-        density, level = self.density(folder, head, settings), report["scan"]["hair_level"]
         if "guides" in stages:
             result["scores"]["guides"]["coverage"] = coverage(stages["guides"], density, level, COVERED * case.spacing)
             result["orientation"] = orientation_scores(density, level, settings, scan.truth, stages["guides"])
-        places = sample_curves(scan.truth, 1.0).points
-        result["hair_kept"] = float(np.mean(density.sample(places) != 0.0))  # what is cleared or not stored is 0
         return result
 
     def _scores(self, case: Case, truth: Strands, stages: dict[str, Strands], head: Head) -> dict[str, dict[str, Any]]:

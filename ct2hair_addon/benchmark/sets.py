@@ -224,7 +224,7 @@ def heads(bench: Bench, options: Options) -> Page:
 
 def ablation(bench: Bench, options: Options) -> Page:
     """The paper's ablations: orientations by gradients and by Gabor filters, blending, optimisation (4.1)."""
-    orientations = Table(
+    fields = Table(
         "Orientation (paper 4.1.1), and the guides that the paper's own steps make of it",
         ("style", "method", "median off (degrees)", "90 %", "guides", "F 1/10", "F 2/20", "consistency", "covered", "seconds"),
     )
@@ -256,7 +256,7 @@ def ablation(bench: Bench, options: Options) -> Page:
             numbers.append(result)
             off, guides = result["orientation"], result["scores"]["guides"]
             f = guides["strand"]
-            orientations.rows.append(
+            fields.rows.append(
                 (
                     case.style, label, off["median"], off["p90"], guides["counts"]["result_strands"], f["1/10"]["f"],
                     f["2/20"]["f"], guides["consistency"], guides["coverage"], off["seconds"],
@@ -293,7 +293,7 @@ def ablation(bench: Bench, options: Options) -> Page:
                 )
             )  # fmt: skip
         bench.clear_runs()
-    return Page([orientations, blends, fits], {}, notes + _notes(options, numbers), numbers)
+    return Page([fields, blends, fits], {}, notes + _notes(options, numbers), numbers)
 
 
 def _coders() -> dict[str, dict[str, str]]:

@@ -265,6 +265,11 @@ def coverage(strands: Strands, density: BrickVolume, hair_level: float, reach: f
     return float((index[:, 0] >= 0).mean())
 
 
+def hair_kept(truth: Strands, density: BrickVolume) -> float:
+    """Share of the true strands' length that a wig's density holds: what is cleared or not stored is 0 there."""
+    return float(np.mean(density.sample(sample_curves(truth, 2.0 * TARGET_STEP).points) != 0.0))
+
+
 def scan_scores(strands: Strands, density: BrickVolume, strand_level: float, progress: Progress = silent) -> dict[str, float]:
     """Scores of strands against the scan that they were made from, where there is no truth.
 

@@ -14,6 +14,7 @@ from ..progress import Progress, part, silent
 from ..volume import BrickVolume
 from ..volume.grid import voxel
 from ..volume.strand_signal import INTERPOLATION_VARIANCE, StrandProfile
+from .curves import segment_lengths
 from .pruning import amplitude, excess_of
 
 PLACES = np.arange(-2.0, 4.01, 0.5)
@@ -47,34 +48,27 @@ def settle_tips(
     own = ndtr(-PLACES / spread)
     moved = np.zeros(len(offsets) - 1)
     tips = np.zeros((len(moved), 3))
-    may = np.ascontiguousarray(traced, bool)
-    _settle(density.table, excess, voxels, offsets, visible, may, mark.peak, mark.seen, ends, own, moved, tips)
-    out = np.array(points)
     last = offsets[1:] - 1
+    strand = np.repeat(np.arange(len(moved)), np.diff(offsets))
+    lengths = np.bincount(strand, segment_lengths(voxels, offsets), len(moved))
+    may = np.asarray(traced, bool) & (np.diff(offsets) > 1) & (visible[last] >= 1.0) & (lengths >= LEAST_LENGTH)
+    _settle(density.table, excess, voxels, offsets, may, mark.peak, mark.seen, ends, own, moved, tips)
+    out = np.array(points)
     out[last] += tips * density.spacing
     progress(1.0, 1.0)
     return out, moved * density.spacing
 
 
 @numba.njit(cache=True, parallel=True)
-def _settle(table, excess, points, offsets, visible, may, peak, seen, ends, own, moved, tips):
+def _settle(table, excess, points, offsets, may, peak, seen, ends, own, moved, tips):
     """Fill `moved` (N,), and `tips` (N, 3) with the moves, voxels, of the strands that `may` (N,).
 
     ends (moves, places), own (places,): the share of a strand's height at each place after each move, and as it is.
     """
     for n in numba.prange(len(moved)):
+        if not may[n]:
+            continue
         start, last = offsets[n], offsets[n + 1] - 1
-        if not may[n] or last - start < 1 or visible[last] < 1.0:
-            continue
-        length = 0.0
-        for m in range(start, last):
-            length += np.sqrt(
-                (points[m + 1, 0] - points[m, 0]) ** 2
-                + (points[m + 1, 1] - points[m, 1]) ** 2
-                + (points[m + 1, 2] - points[m, 2]) ** 2
-            )
-        if length < LEAST_LENGTH:
-            continue
         tx, ty, tz = _end_tangent(points, start, last)
         x, y, z = points[last, 0], points[last, 1], points[last, 2]
         shown = np.empty(len(PLACES))
@@ -102,7 +96,7 @@ def _settle(table, excess, points, offsets, visible, may, peak, seen, ends, own,
 
 @numba.njit(cache=True, inline="always")
 def _end_tangent(points, start, last):
-    """The unit direction in which the cubic through a strand's control points ends: as if it bent on evenly."""
+    """The unit direction in which a strand ends, as it bends between its last three control points."""
     x = points[last, 0] - points[last - 1, 0]
     y = points[last, 1] - points[last - 1, 1]
     z = points[last, 2] - points[last - 1, 2]

@@ -11,6 +11,7 @@ from ct2hair_addon.evaluation import (
     direction_share,
     evaluate,
     format_scores,
+    hair_kept,
     orientation_error,
     registration_error,
     render_density,
@@ -211,6 +212,14 @@ def test_coverage_is_the_share_of_hair_with_a_strand_near():
     volume = BrickVolume.from_dense(density, 1.0)
     guide = lines(([4, 8, 8], [31.5, 8, 8]))
     assert coverage(guide, volume, 0.5, 1.0) == pytest.approx(0.5, abs=0.02)
+
+
+def test_hair_is_kept_where_the_density_is_not_cleared():
+    density = np.ones((64, 16, 16), np.float32)
+    density[:20] = 0.0
+    volume = BrickVolume.from_dense(density, 1.0)
+    assert hair_kept(lines(([4, 8, 8], [36, 8, 8])), volume) == pytest.approx(0.5, abs=0.05)
+    assert hair_kept(lines(([24, 8, 8], [60, 8, 8])), volume) == 1.0
 
 
 def test_strands_fit_their_own_noisy_scan_and_no_other():
