@@ -48,7 +48,7 @@ TEXTS = {
     "refinement": "fitting strands to the scan",
     "result": "writing the result",
 }
-AMENDED_BY = RefinementSettings(iterations=15)
+AMENDED_BY = RefinementSettings(iterations=10)
 """How guides are fitted to be amended, whatever is wanted of the refinement: guides then depend on their own settings alone."""
 TRACED, AMENDING = "traced", 0.7
 """The checkpoint within the guides' stage, and how long one amendment takes, tracing taking 1."""

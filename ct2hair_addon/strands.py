@@ -16,6 +16,8 @@ from .errors import StrandFileError
 
 POINT_PREFIX = "point_"
 """Key prefix of per-point attributes in an npz file; per-strand attributes keep their plain name."""
+MOST_CELLS = 512
+"""Cells along an axis that places are marked in at most: 134 MB."""
 
 
 def normalized(vectors: np.ndarray) -> np.ndarray:
@@ -27,6 +29,40 @@ def point_tree(points: np.ndarray) -> cKDTree:
     """A tree to find the nearest of many points (M, 3) in. Strands' lie evenly: cells cut in the middle answer as soon as
     balanced ones, and are made in half the time."""
     return cKDTree(points, balanced_tree=False)
+
+
+def points_around(points: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
+    """Indices, rising, of all of `points` (M, 3) within `reach` of one of `places` (N, 3), and of few that are not: a tree of
+    these answers for `places` as one of all would."""
+    if not len(places):
+        return np.zeros(0, np.int64)
+    low, high = places.min(axis=0).astype(np.float64) - reach, places.max(axis=0).astype(np.float64) + reach
+    cell = max(reach, float((high - low).max()) / MOST_CELLS)
+    near = np.zeros(((high - low) / cell).astype(np.int64) + 1, bool)
+    _mark(places, low, cell, reach, near)
+    return np.flatnonzero(_marked(points, low, cell, near))
+
+
+@numba.njit(cache=True)
+def _mark(places, low, cell, reach, near):
+    """Set the cells of `near` that hold anything within `reach` of one of `places`."""
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(places)):
+        for axis in range(3):
+            first[axis] = max(int((places[n, axis] - reach - low[axis]) / cell), 0)
+            last[axis] = min(int((places[n, axis] + reach - low[axis]) / cell), near.shape[axis] - 1)
+        near[first[0] : last[0] + 1, first[1] : last[1] + 1, first[2] : last[2] + 1] = True
+
+
+@numba.njit(cache=True, parallel=True)
+def _marked(points, low, cell, near):
+    """(M,) bool: the points in cells of `near`."""
+    out = np.zeros(len(points), np.bool_)
+    for n in numba.prange(len(points)):
+        i, j, k = (points[n, 0] - low[0]) / cell, (points[n, 1] - low[1]) / cell, (points[n, 2] - low[2]) / cell
+        if i >= 0.0 and j >= 0.0 and k >= 0.0 and i < near.shape[0] and j < near.shape[1] and k < near.shape[2]:
+            out[n] = near[int(i), int(j), int(k)]
+    return out
 
 
 @dataclass(frozen=True)

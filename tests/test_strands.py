@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ct2hair_addon.errors import StrandFileError
-from ct2hair_addon.strands import Strands, concatenate
+from ct2hair_addon.strands import Strands, concatenate, point_tree, points_around
 
 
 def two_strands() -> Strands:
@@ -103,3 +103,22 @@ def test_resampling_never_lengthens_a_strand(counts, size, seed):
     strands = Strands.from_polylines([rng.normal(size=(n, 3)) for n in counts])
     chords = np.linalg.norm(np.diff(strands.resampled(size), axis=1), axis=2).sum(axis=1)
     assert np.all(chords <= strands.lengths() * (1 + 1e-5) + 1e-5)
+
+
+@pytest.mark.parametrize("reach", [0.3, 6.0])
+def test_a_tree_of_the_points_around_answers_as_one_of_all(reach):
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-60.0, 60.0, (20_000, 3)).astype(np.float32)
+    places = np.concatenate([points[:40] + np.float32(0.1), rng.uniform(-20.0, 30.0, (40, 3)), [[900.0, 0.0, 0.0]]])
+    some = points_around(points, places, reach)
+    assert len(some) < 0.5 * len(points)
+    distance, near = point_tree(points).query(places, k=6, distance_upper_bound=reach)
+    fewer, among = point_tree(points[some]).query(places, k=6, distance_upper_bound=reach)
+    np.testing.assert_array_equal(fewer, distance)
+    found = np.isfinite(distance)
+    assert found.any()
+    np.testing.assert_array_equal(some[among[found]], near[found])
+
+
+def test_nothing_is_around_no_places():
+    assert not len(points_around(np.zeros((5, 3), np.float32), np.zeros((0, 3)), 1.0))

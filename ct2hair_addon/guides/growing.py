@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
-from ..strands import Strands, normalized, offsets_from_counts, point_tree
+from ..strands import Strands, normalized, offsets_from_counts, point_tree, points_around
 from .direction import TOUCH, end_tangents
 
 REACHES = (1.0, 2.0, 4.0)
@@ -53,10 +53,12 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
     current = strands.select(fresh)
     for reach in REACHES:
         for _ in range(MOST_ROUNDS):
+            waiting = np.flatnonzero(~reached)
+            if not len(waiting):
+                break
             if len(fresh):
                 forest.append((point_tree(current.points), current, current.tangents()))
-            waiting = np.flatnonzero(~reached)
-            if not len(waiting) or not forest:
+            if not forest:
                 break
             source, place, found = _guides_for(
                 strands.roots[waiting], forward[waiting], forest, reach * settings.neighbour_radius
@@ -111,8 +113,11 @@ def course_around(strands: Strands, places: np.ndarray, own: np.ndarray) -> np.n
     """(N, 3) float64 unit: which way hair goes around `places` (N, 3), the mean of the directed `strands` there, those against
     the directions `own` (N, 3) left out; `own` itself counts little, unless there is no other."""
     hair = strands.resampled_by_step(COURSE_STEP)
-    tangents = hair.tangents().astype(np.float64)
-    distance, near = point_tree(hair.points).query(places, k=COURSE_POINTS, distance_upper_bound=COURSE_REACH, workers=-1)
+    some = points_around(hair.points, places, COURSE_REACH)
+    if not len(some):
+        return normalized(own)
+    points, tangents = hair.points[some], hair.tangents()[some].astype(np.float64)
+    distance, near = point_tree(points).query(places, k=COURSE_POINTS, distance_upper_bound=COURSE_REACH, workers=-1)
     found = np.isfinite(distance)
     tangents = tangents[np.where(found, near, 0)]
     along = found & (np.einsum("nkc,nc->nk", tangents, own) > 0.0)

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
-from ..strands import Strands, offsets_from_counts, point_tree
+from ..strands import Strands, offsets_from_counts, point_tree, points_around
 from ..volume.grid import BrickVolume
 from .sampling import density_at
 
@@ -112,10 +112,11 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
         return Pieces(lines, np.zeros(0, np.int64), np.zeros(0, np.int64))
     tangents, index = lines.tangents(), lines.strand_index
     ends = np.concatenate([lines.offsets[:-1], lines.offsets[1:] - 1])
-    tree = point_tree(lines.points)
+    some = points_around(lines.points, lines.points[ends], CONTACT * voxel)
+    tree = point_tree(lines.points[some])
     near = tree.query(lines.points[ends], k=24, distance_upper_bound=CONTACT * voxel, workers=-1)[1]
-    row, column = np.nonzero(near < len(lines.points))
-    place, end = near[row, column], ends[row]
+    row, column = np.nonzero(near < len(some))
+    place, end = some[near[row, column]], ends[row]
     beside = (index[place] != index[end]) & (np.abs(np.einsum("nc,nc->n", tangents[place], tangents[end])) > 0.7)
     place, row, column = place[beside], row[beside], column[beside]
     # of each line beside an end the nearest point, which the tree gives first

@@ -7,9 +7,6 @@ import numpy as np
 
 from ..volume.grid import UNIT, trilinear
 
-PATCH = 24
-"""Voxels along an edge of a patch."""
-
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def density_at(table, bricks, x, y, z):
@@ -39,48 +36,6 @@ def _amid(low, high, u, v, w):
 
 
 @numba.njit(cache=True, nogil=True)
-def patch_around(table, bricks, x, y, z, values):
-    """Fill `values` (PATCH^3,) with the voxels around (x, y, z), 0 off the bricks: (values, x, y, z) of the first of them."""
-    i0, j0, k0 = int(np.floor(x)) - PATCH // 2 + 1, int(np.floor(y)) - PATCH // 2 + 1, int(np.floor(z)) - PATCH // 2 + 1
-    for I in range(i0 >> 4, ((i0 + PATCH - 1) >> 4) + 1):
-        i1, i2 = max(16 * I, i0), min(16 * I + 16, i0 + PATCH)
-        for J in range(j0 >> 4, ((j0 + PATCH - 1) >> 4) + 1):
-            j1, j2 = max(16 * J, j0), min(16 * J + 16, j0 + PATCH)
-            for K in range(k0 >> 4, ((k0 + PATCH - 1) >> 4) + 1):
-                k1, k2 = max(16 * K, k0), min(16 * K + 16, k0 + PATCH)
-                row = -1
-                if 0 <= I < table.shape[0] and 0 <= J < table.shape[1] and 0 <= K < table.shape[2]:
-                    row = table[I, J, K]
-                for i in range(i1, i2):
-                    for j in range(j1, j2):
-                        at = ((i - i0) * PATCH + j - j0) * PATCH + k1 - k0
-                        if row >= 0:
-                            line = bricks[row, i & 15, j & 15, k1 & 15 : (k1 & 15) + k2 - k1]
-                            for k in range(k2 - k1):
-                                values[at + k] = line[k]
-                        else:
-                            values[at : at + k2 - k1] = 0.0
-    return values, float(i0), float(j0), float(k0)
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def density_near(table, bricks, patch, x, y, z):
-    """`density_at`, again several times faster where a `patch` of the density (`patch_around`) holds what is asked for."""
-    values, ox, oy, oz = patch
-    u, v, w = x - ox, y - oy, z - oz
-    if 0.0 <= u < PATCH - 1 and 0.0 <= v < PATCH - 1 and 0.0 <= w < PATCH - 1:
-        i, j, k = int(u), int(v), int(w)
-        at = (i * PATCH + j) * PATCH + k
-        low = values[at], values[at + 1], values[at + PATCH], values[at + PATCH + 1]
-        at += PATCH * PATCH
-        high = values[at], values[at + 1], values[at + PATCH], values[at + PATCH + 1]
-        value = _amid(low, high, u - i, v - j, w - k)
-    else:
-        value = trilinear(table, bricks, np.float32(0.0), x, y, z)
-    return value
-
-
-@numba.njit(cache=True, nogil=True)
 def course_at(table, bricks, x, y, z):
     """(x, y, z, trust): the unit direction, sign without meaning, at the voxel nearest to (x, y, z), and 0 to 1; 0 off hair.
 
@@ -104,15 +59,12 @@ def course_at(table, bricks, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True)
-def line_mean(table, bricks, x, y, z, dx, dy, dz, reach, patch=None):
+def line_mean(table, bricks, x, y, z, dx, dy, dz, reach):
     """The mean density at the 2 reach + 1 points a voxel apart on the line through (x, y, z)."""
     total = 0.0
     for k in range(-reach, reach + 1):
         px, py, pz = x + k * dx, y + k * dy, z + k * dz
-        if patch is None:
-            total += density_at(table, bricks, px, py, pz)
-        else:
-            total += density_near(table, bricks, patch, px, py, pz)
+        total += density_at(table, bricks, px, py, pz)
     return total / (2 * reach + 1)
 
 
@@ -131,11 +83,11 @@ def plane(dx, dy, dz):
 
 
 @numba.njit(cache=True, nogil=True)
-def centred(table, bricks, x, y, z, dx, dy, dz, reach, most, patch=None):
+def centred(table, bricks, x, y, z, dx, dy, dz, reach, most):
     """(x, y, z, value): the point moved to the peak of the density in the plane normal to d, by at most `most` voxels.
 
     The density is averaged over 2 reach + 1 points along d; the peak is that of a least-squares paraboloid
-    through a 3 x 3 grid, or the grid's best point where the paraboloid has no peak nearby. patch: of the density, around there.
+    through a 3 x 3 grid, or the grid's best point where the paraboloid has no peak nearby.
     """
     ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
     grid = 0.8
@@ -144,7 +96,7 @@ def centred(table, bricks, x, y, z, dx, dy, dz, reach, most, patch=None):
     for a in range(-1, 2):
         for b in range(-1, 2):
             px, py, pz = x + grid * (a * ux + b * vx), y + grid * (a * uy + b * vy), z + grid * (a * uz + b * vz)
-            value = line_mean(table, bricks, px, py, pz, dx, dy, dz, reach, patch)
+            value = line_mean(table, bricks, px, py, pz, dx, dy, dz, reach)
             total += value
             sum_u += a * value
             sum_v += b * value

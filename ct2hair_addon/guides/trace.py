@@ -18,7 +18,7 @@ from ..progress import Progress, silent
 from ..settings import GuideSettings
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, add_strand
-from .sampling import PATCH, centred, course_at, density_at, density_near, line_mean, patch_around, plane
+from .sampling import centred, course_at, density_at, line_mean, plane
 
 MOST_STEPS = 3000
 """Steps to one side of a seed at most: over a metre of hair at 0.4 mm."""
@@ -31,9 +31,6 @@ ALIVE, FAINT = 0.55, 0.2
 the peak is not looked for."""
 LOOK = 10
 """voxel; how far ahead the density is summed."""
-HALFWAY, SPARE = 8, 2
-"""voxel; how far ahead the middle of the patch lies in which the density is read, and what it holds around a path's end and the
-look-ahead's at least."""
 RINGS = ((0.12, 6), (0.26, 8), (0.45, 10))
 """Directions tried around the present one: (tangent of the angle, how many)."""
 TURN_COST = 0.8
@@ -99,13 +96,6 @@ WEIGHTS = np.linspace(1.0, 0.4, LOOK)
 """Weights of the look-ahead's samples: what is near says more, since hair curves."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _held(patch, x, y, z):
-    """Whether a patch holds a point and a few voxels around it."""
-    low, high = SPARE, PATCH - 1 - SPARE
-    return low <= x - patch[1] <= high and low <= y - patch[2] <= high and low <= z - patch[3] <= high
-
-
 @numba.njit(cache=True, nogil=True)
 def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
     """Follow one way from (x, y, z) along d into `path` (n, 3) voxels; returns (points, reason)."""
@@ -113,12 +103,9 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
     count = 0
     start_x, start_y, start_z = x, y, z
     scores = np.empty(len(fan))
-    patch = patch_around(table, bricks, x + HALFWAY * dx, y + HALFWAY * dy, z + HALFWAY * dz, np.empty(PATCH**3, np.float32))
     while True:
         if count == len(path):
             return count, End.LONG
-        if not (_held(patch, x, y, z) and _held(patch, x + LOOK * dx, y + LOOK * dy, z + LOOK * dz)):
-            patch = patch_around(table, bricks, x + HALFWAY * dx, y + HALFWAY * dy, z + HALFWAY * dz, patch[0])
         ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
         # Hair goes on bending as it did: the look-ahead bends along, or in a curl it would see the neighbours.
         bx = by = bz = 0.0
@@ -147,7 +134,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
             for k in range(len(weights) - 1, -1, -1):
                 far, bent = k + 1.0, 0.5 * (k + 1.0) ** 2
                 px, py, pz = x + far * ex + bent * bx, y + far * ey + bent * by, z + far * ez + bent * bz
-                total += weights[k] * min(density_near(table, bricks, patch, px, py, pz) * strands, MOST)
+                total += weights[k] * min(density_at(table, bricks, px, py, pz) * strands, MOST)
                 left -= weights[k] * MOST
                 if total + left < wanted:
                     break
@@ -176,9 +163,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         ex, ey, ez = dx + a * ux + b * vx, dy + a * uy + b * vy, dz + a * uz + b * vz
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
-        qx, qy, qz, _value = centred(
-            table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step, patch
-        )
+        qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step)
         # Inertia: the new direction leans on the last few steps' secant.
         if count >= 4:
             sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]
@@ -204,47 +189,46 @@ def smoothed(path, widths, most):
     (root mean square, in the path's unit) of the points. Long windows for smooth hair, short ones for curls."""
     size = len(path)
     out = path.copy()
+    m0, m1, m2, f0 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(size):
+        s0 = s1 = s2 = s3 = s4 = square = 0.0
+        m0[:], m1[:], m2[:] = 0.0, 0.0, 0.0
+        low, high = n, n - 1
         for w in range(len(widths)):
-            half = min(widths[w], n, size - 1 - n)
-            full = widths[w]
-            # Windows slide inwards at the ends, so that the ends are smoothed as well.
-            first, last = n - half, n + half
-            if half < full:
-                first, last = max(n - full, 0), min(n + full, size - 1)
+            # Windows end with the path. Each holds the one before: only what is new is summed.
+            first, last = max(n - widths[w], 0), min(n + widths[w], size - 1)
             if last - first < 4:
                 continue
-            s0 = s1 = s2 = s3 = s4 = 0.0
-            for m in range(first, last + 1):
-                t = float(m - n)
-                s0 += 1.0
-                s1 += t
-                s2 += t * t
-                s3 += t * t * t
-                s4 += t * t * t * t
+            for side in range(2):
+                begin, end = (first, low) if side == 0 else (high + 1, last + 1)
+                for m in range(begin, end):
+                    t = float(m - n)
+                    s0 += 1.0
+                    s1 += t
+                    s2 += t * t
+                    s3 += t * t * t
+                    s4 += t * t * t * t
+                    for axis in range(3):
+                        value = float(path[m, axis] - path[n, axis])
+                        m0[axis] += value
+                        m1[axis] += t * value
+                        m2[axis] += t * t * value
+                        square += value * value
+            low, high = first, last
             # Cofactors of the first row of the normal matrix: the fit's value at n is a combination of the moments.
             c0, c1, c2 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
             det = s0 * c0 + s1 * c1 + s2 * c2
             k11, k12, k22 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3, s0 * s2 - s1 * s1
-            wrong = 0.0
-            values = np.empty(3)
+            wrong = square
             for axis in range(3):
-                m0 = m1 = m2 = square = 0.0
-                for m in range(first, last + 1):
-                    t, value = float(m - n), float(path[m, axis] - path[n, axis])
-                    m0 += value
-                    m1 += t * value
-                    m2 += t * t * value
-                    square += value * value
-                f0 = (c0 * m0 + c1 * m1 + c2 * m2) / det
-                f1 = (c1 * m0 + k11 * m1 + k12 * m2) / det
-                f2 = (c2 * m0 + k12 * m1 + k22 * m2) / det
-                wrong += max(square - f0 * m0 - f1 * m1 - f2 * m2, 0.0)
-                values[axis] = f0
+                f0[axis] = (c0 * m0[axis] + c1 * m1[axis] + c2 * m2[axis]) / det
+                f1 = (c1 * m0[axis] + k11 * m1[axis] + k12 * m2[axis]) / det
+                f2 = (c2 * m0[axis] + k12 * m1[axis] + k22 * m2[axis]) / det
+                wrong -= f0[axis] * m0[axis] + f1 * m1[axis] + f2 * m2[axis]
             if w > 0 and wrong > most * most * s0:
                 break
             for axis in range(3):
-                out[n, axis] = path[n, axis] + values[axis]
+                out[n, axis] = path[n, axis] + f0[axis]
     return out
 
 

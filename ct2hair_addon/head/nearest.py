@@ -191,7 +191,8 @@ def _bounds(corners, order, child, first, count):
 
 
 @numba.njit(cache=True, inline="always")
-def _box_distance2(boxes, node, x, y, z):
+def box_distance2(boxes, node, x, y, z):
+    """The squared distance from a point to a node's box, 0 within."""
     dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
     dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
     dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
@@ -241,7 +242,7 @@ def nearest_one(boxes, child, first, count, corners, x, y, z, reach2):
     best, best_slot, best_v, best_w = reach2, -1, 0.0, 0.0
     stack = np.empty(STACK, np.int32)
     bound = np.empty(STACK)
-    stack[0], bound[0] = 0, _box_distance2(boxes, 0, x, y, z)
+    stack[0], bound[0] = 0, box_distance2(boxes, 0, x, y, z)
     top = 1
     while top > 0:
         top -= 1
@@ -250,8 +251,8 @@ def nearest_one(boxes, child, first, count, corners, x, y, z, reach2):
             continue
         while child[node] >= 0:
             left = child[node]
-            d_left = _box_distance2(boxes, left, x, y, z)
-            d_right = _box_distance2(boxes, left + 1, x, y, z)
+            d_left = box_distance2(boxes, left, x, y, z)
+            d_right = box_distance2(boxes, left + 1, x, y, z)
             closer = left
             if d_right < d_left:
                 closer = left + 1

@@ -11,12 +11,15 @@ import numpy as np
 from ..strands import normalized
 from .flatten import scalp_patch, unwrap
 from .mesh import HeadMesh, boundary_loops, face_areas
-from .nearest import CHUNK, TriangleTree, nearest_one, winding_one
+from .nearest import CHUNK, TriangleTree, box_distance2, nearest_one, winding_one
 
 CELLS = 192
 """Cells along one edge of the texture-space grid: one to three triangles each for scalps of some 10,000 triangles."""
 SIDES = 4.0
 """Grid on which inside and outside are tabulated, mm: 300,000 nodes for a head."""
+PEEK, PEEKED = 0.01, 0.8
+"""mm before and behind a triangle where inside and outside are looked at, and the share that a corner has of the places: three,
+since other parts of the mesh may run through it."""
 POOL = 10
 """Candidates for each scalp sample: enough for a blue-noise spectrum, few enough to be quick."""
 SHRINK = 0.94
@@ -119,11 +122,23 @@ class Head:
         grid = np.where(tree.winding(nodes) > 0.5, -distance, distance)
         return low, np.ascontiguousarray(grid.reshape(size))
 
+    @functools.cached_property
+    def walls(self) -> np.ndarray:
+        """(F,) bool, by slot of the solid tree: the triangles with the inside behind them and the outside before them."""
+        tree = self.solid_tree
+        corner = tree.corners.reshape(-1, 3, 3)
+        weights = np.full((3, 3), 0.5 * (1.0 - PEEKED)) + (1.5 * PEEKED - 0.5) * np.eye(3)
+        normal = normalized(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+        place, step = np.matmul(weights, corner), PEEK * normal[:, None]
+        before, behind = (tree.winding((place + way * step).reshape(-1, 3)).reshape(-1, 3) for way in (1.0, -1.0))
+        return ((before < 0.5) & (behind > 0.5)).all(axis=1)
+
     def signed_distance(self, points: np.ndarray, beyond: float = np.inf) -> np.ndarray:
         """(M,) float32 mm from `points` (M, 3) to the closed head, negative inside; exact to float.
 
         beyond: mm; of points farther from the surface than this only something between it and their distance is told, which
-        is much quicker. The side is a grid node's where the node's own empty ball holds the point, else the winding number's.
+        is much quicker. The side is a grid node's where the node's own empty ball holds the point, else the nearest triangle's
+        where that is a wall and nearest within its edges, else the winding number's.
         """
         points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
         out = np.empty(len(points), np.float32)
@@ -131,7 +146,8 @@ class Head:
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             _signed_distance(
-                points[part], *tree.arrays, tree.centre, tree.dipole, tree.radius, *self.sides, float(beyond), out[part]
+                points[part], *tree.arrays, tree.centre, tree.dipole, tree.radius, *self.sides, self.walls, float(beyond),
+                out[part],
             )  # fmt: skip
         return out
 
@@ -226,22 +242,47 @@ def inside_one(boxes, child, first, count, corners, centre, dipole, radius, low,
 
 
 @numba.njit(cache=True, parallel=True, nogil=True)
-def _signed_distance(points, boxes, child, first, count, order, corners, centre, dipole, radius, low, sides, beyond, out):
+def _signed_distance(
+    points, boxes, child, first, count, order, corners, centre, dipole, radius, low, sides, walls, beyond, out
+):
     for n in numba.prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
+        dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
+        off, node = np.sqrt(dx * dx + dy * dy + dz * dz), sides[i, j, k]
+        if abs(node) - off > beyond:
+            out[n] = node - off if node > 0.0 else node + off
+            continue
+        box2 = box_distance2(boxes, 0, x, y, z)
+        if box2 > beyond * beyond:
+            out[n] = np.sqrt(box2)
+            continue
         # no farther than the nearest grid node's distance allows: most of the tree is never visited
-        bound = np.inf
-        i, j, k = int((x - low[0]) / SIDES + 0.5), int((y - low[1]) / SIDES + 0.5), int((z - low[2]) / SIDES + 0.5)
-        if x > low[0] and y > low[1] and z > low[2] and i < sides.shape[0] and j < sides.shape[1] and k < sides.shape[2]:
-            dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
-            off, node = np.sqrt(dx * dx + dy * dy + dz * dz), sides[i, j, k]
-            if abs(node) - off > beyond:
-                out[n] = node - off if node > 0.0 else node + off
-                continue
-            bound = (abs(node) + off + 1e-3) ** 2
-        d2, _, _, _ = nearest_one(boxes, child, first, count, corners, x, y, z, bound)
-        inside = inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, x, y, z)
+        d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, (abs(node) + off + 1e-3) ** 2)
+        if box2 > 0.0:
+            inside = False
+        elif off < abs(node):
+            inside = node < 0.0
+        elif slot >= 0 and walls[slot] and v > 0.0 and w > 0.0 and v + w < 1.0:
+            inside = _behind(corners, slot, x, y, z)
+        else:
+            inside = winding_one(boxes, child, first, count, corners, centre, dipole, radius, x, y, z) > 0.5
         out[n] = -np.sqrt(d2) if inside else np.sqrt(d2)
+
+
+@numba.njit(cache=True, inline="always")
+def _node(along, size):
+    """The grid node nearest to a place `along` an axis of it."""
+    return int(min(max(along / SIDES + 0.5, 0.0), size - 1.0))
+
+
+@numba.njit(cache=True)
+def _behind(corners, slot, x, y, z):
+    """Whether a point lies behind a triangle's plane."""
+    ax, ay, az = corners[slot, 0], corners[slot, 1], corners[slot, 2]
+    ux, uy, uz = corners[slot, 3] - ax, corners[slot, 4] - ay, corners[slot, 5] - az
+    vx, vy, vz = corners[slot, 6] - ax, corners[slot, 7] - ay, corners[slot, 8] - az
+    return (uy * vz - uz * vy) * (x - ax) + (uz * vx - ux * vz) * (y - ay) + (ux * vy - uy * vx) * (z - az) < 0.0
 
 
 @numba.njit(cache=True)

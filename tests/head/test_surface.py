@@ -43,6 +43,29 @@ def test_the_signed_distance_is_the_trees_and_the_winding_numbers(template_queri
     np.testing.assert_allclose(template_queries.signed_distance(points), expected, atol=1e-4)
 
 
+def test_where_a_mesh_runs_through_itself_the_inner_walls_are_none(ball):
+    """A second ball is sunk into the first, below its scalp: what of each surface lies in the other has the inside around it."""
+    moved = ball.vertices + np.float32([0.0, 0.0, -60.0])
+    count = len(ball.vertices)
+    both = Head(
+        replace(
+            ball,
+            vertices=np.concatenate([ball.vertices, moved]),
+            faces=np.concatenate([ball.faces, ball.faces + count]),
+            uv=np.concatenate([ball.uv, np.full_like(ball.uv, np.nan)]),
+            scalp=np.concatenate([ball.scalp, np.zeros(count, bool)]),
+        )
+    )
+    generator = np.random.default_rng(5)
+    points = both.mesh.vertices[generator.integers(0, 2 * count, 4000)] + generator.normal(0, 1.5, (4000, 3))
+    inside = np.minimum(np.linalg.norm(points, axis=1), np.linalg.norm(points - [0.0, 0.0, -60.0], axis=1)) < RADIUS - SAGITTA
+    clear = both.solid_tree.nearest(points)[0] > 1e-3
+    assert 0.1 < both.walls.mean() < 0.9 and inside.mean() > 0.3
+    found = both.signed_distance(points) < 0.0
+    np.testing.assert_array_equal(found[clear], both.solid_tree.winding(points)[clear] > 0.5)
+    assert found[inside].all()
+
+
 @pytest.mark.parametrize("beyond", [0.05, 4.0, 30.0])
 def test_beyond_what_is_asked_a_bound_of_the_distance_is_told(template_queries, beyond):
     points = np.random.default_rng(3).uniform(-200, 400, (4000, 3)) + template_queries.mesh.vertices.mean(axis=0) - 100.0
