@@ -44,7 +44,7 @@ def test_the_signed_distance_is_the_trees_and_the_winding_numbers(template_queri
 
 
 def test_where_a_mesh_runs_through_itself_the_inner_walls_are_none(ball):
-    """A second ball is sunk into the first, below its scalp: what of each surface lies in the other has the inside around it."""
+    """A second ball is sunk into the first, below its scalp: what of each lies in the other has the inside on both sides."""
     moved = ball.vertices + np.float32([0.0, 0.0, -60.0])
     count = len(ball.vertices)
     both = Head(
