@@ -310,7 +310,7 @@ class _Job:
         fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone, final=False)
         if not len(fitted.strands):
             return guides
-        usual, known = guides.profile, guides.tally
+        usual, known, followed = guides.profile, guides.tally, guides.followed
         del guides, traced
         pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
         counts = fitted.tally | cut
@@ -322,10 +322,10 @@ class _Job:
         step, wanted = part(progress, 0.75, 1.0), settings.guides
         rest = partial(unexplained, pieces, density, level, head, profile)
         amended = amend_guides(
-            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted=counted
+            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted, followed
         )
         tally = {f"amended {number}: {name}": count for name, count in (counts | amended.tally).items()}
-        return Guides(amended.strands, usual, known | tally)
+        return Guides(amended.strands, usual, known | tally, followed)
 
     def _write(
         self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined

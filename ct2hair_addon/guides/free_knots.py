@@ -34,19 +34,31 @@ CHUNK = 4096
 """Strands whose ways are looked at together: some 300 MB."""
 
 
+def usually_followed(strands: Strands, made: np.ndarray) -> float:
+    """The median of how far strands were followed back, mm, of those that were: `made` (N,) points at their roots; 0 if none."""
+    followed = strands.arc_lengths()[strands.offsets[:-1] + made][made > 0]
+    return float(np.median(followed)) if len(followed) else 0.0
+
+
 def lead_to_free_knots(
-    strands: Strands, made: np.ndarray, rest: np.ndarray, free: np.ndarray, head: Head, progress: Progress = silent
+    strands: Strands,
+    made: np.ndarray,
+    rest: np.ndarray,
+    free: np.ndarray,
+    head: Head,
+    progress: Progress = silent,
+    usual: float | None = None,
 ) -> tuple[Strands, np.ndarray, np.ndarray]:
     """Strands with those of `rest` (R,) led back through the hair around them to one of the knots `free` (K, 3) mm each.
 
-    made (N,): points at the root of each that were not traced. Each knot goes to one strand at most, so that they are as near
-    as possible beside the strands' ways over the scalp, and not far back. A strand runs from its knot, over the way that it was
-    followed, up to where it was traced; one without a knot stays as it is. Returns (strands, (N, 3) float64 the knots, (N,)
-    bool which have one).
+    made (N,): points at the root of each that were not traced. usual: how far the wig's strands usually had to be followed, mm
+    (None: these, `usually_followed`). Each knot goes to one strand at most, so that they are as near as possible beside the
+    strands' ways over the scalp, and not far back. A strand runs from its knot, over the way that it was followed, up to where
+    it was traced, and nowhere higher than that way; one without a knot stays as it is. Returns (strands, (N, 3) float64 the
+    knots, (N,) bool which have one).
     """
     knots, tied = np.zeros((len(strands), 3)), np.zeros(len(strands), bool)
-    followed = strands.arc_lengths()[strands.offsets[:-1] + made][made > 0]
-    farthest = AS_FAR * np.median(followed) if len(followed) else 0.0
+    farthest = AS_FAR * (usually_followed(strands, made) if usual is None else usual)
     if not len(rest) or not len(free) or farthest < LEAVING:
         return strands, knots, tied
     way, counts = _ways(strands, made, rest, head, farthest, progress)
@@ -100,7 +112,8 @@ def _ways(strands: Strands, made: np.ndarray, rest: np.ndarray, head: Head, fart
 
 
 def _relaid(strands, made, won, knot, way, begin, at, head):
-    """The strands `won` from their `knot` (W, 3) on: over the scalp below their `way`, rising evenly to their traced part.
+    """The strands `won` from their `knot` (W, 3) on: over the scalp below their `way`, rising evenly to their traced part, but
+    never over the way: it leads through hair, and above it there may be none.
 
     begin, at (W,): the points of `way` where they were traced from, and by their knot.
     """
@@ -114,10 +127,11 @@ def _relaid(strands, made, won, knot, way, begin, at, head):
     owner = np.repeat(np.arange(len(won)), counts[won])
     step = np.repeat(last, counts[won]) - (np.arange(offsets[-1]) - offsets[won][owner])
     share = ((step - begin[owner]) / np.maximum(at - begin, 1)[owner])[:, None]
-    height = np.maximum(head.signed_distance(way[begin]), LOW)[owner, None]
+    height = np.maximum(head.signed_distance(way), LOW)
+    rising = np.minimum(LOW + (height[begin[owner]] - LOW) * (1.0 - share[:, 0]), height[step])
     aside = knot - head.closest_scalp(way[at]).position
     below = head.closest_scalp(way[step])
-    points = below.position + share * aside[owner] + (LOW + (height - LOW) * (1.0 - share)) * below.normal
+    points = below.position + share * aside[owner] + rising[:, None] * below.normal
     cut = np.where(tied, made, 0)
     keep = np.arange(len(strands.points)) - np.repeat(strands.offsets[:-1], strands.counts) >= np.repeat(cut, strands.counts)
     traced, traced_offsets = strands.points[keep], offsets_from_counts(strands.counts - cut)

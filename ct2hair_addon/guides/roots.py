@@ -35,6 +35,7 @@ def lead_into_scalp(
     knots: np.ndarray | None = None,
     made: np.ndarray | None = None,
     progress: Progress = silent,
+    usual: float | None = None,
 ) -> tuple[Strands, int, int]:
     """Put a curve before each strand that runs from the scalp into its first point's direction; returns (strands, how many
     begin at knots, how many of these at knots that were left).
@@ -42,7 +43,7 @@ def lead_into_scalp(
     The root lies FOLLOWED_BACK of the way to where the hair around, followed straight back, meets the scalp, or at the knot by
     there, if there is one among `knots` (K, 3), mm (`tie_to_knots`). Where `made` (N,) tells how many points of each strand
     were not traced, those without a knot are led to the ones that are left (`lead_to_free_knots`), and so are those that were
-    followed back over the scalp: they may have passed theirs. The curve is a cubic Hermite piece that leaves the scalp leaning
+    followed back over the scalp: they may have passed theirs, `usual` mm and some more. The curve is a cubic Hermite piece that leaves the scalp leaning
     to its normal; a first point already on the scalp or in the head is moved there.
     """
     if not len(strands):
@@ -52,7 +53,7 @@ def lead_into_scalp(
     tied, late = chosen >= 0, np.zeros(len(strands), bool)
     if made is not None and tied.any():
         free = np.delete(knots, chosen[tied], axis=0)
-        strands, left, late = lead_to_free_knots(strands, made, np.flatnonzero(~tied), free, head, progress)
+        strands, left, late = lead_to_free_knots(strands, made, np.flatnonzero(~tied), free, head, progress, usual)
         place[late] = left[late]
     return _led(strands, head, place), int((tied | late).sum()), int(late.sum())
 

@@ -15,6 +15,7 @@ from ..strands import Strands, concatenate
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, support_along
 from .direction import fine_ends, signs
+from .free_knots import usually_followed
 from .growing import follow_to_scalp, grow_to_root
 from .knots import strands_by_knots
 from .linking import cut_segments, link_segments, meeting_ends
@@ -49,11 +50,13 @@ class Guides:
 
     strands: with `support` (N,) float32, the share of the length that was traced in the scan and not grown, and
     `root_uv` (N, 2) float32. profile: what a lone strand looks like in this scan. tally: what was kept and dropped, and why.
+    followed: how far traces had to be followed back to the scalp, mm, the median of those that were; 0 where none was.
     """
 
     strands: Strands
     profile: StrandProfile
     tally: dict[str, int]
+    followed: float = 0.0
 
 
 def find_segments(
@@ -125,11 +128,12 @@ def trace_guides(
     segments, profile, tally = find_segments(density, hair_level, way, seeds, settings, part(progress, 0.0, 0.85), peak)
     del seeds, way
     floor = data_floor(density, hair_level, head)
-    strands, more = root_segments(
-        segments, density.spacing, head, settings, part(progress, 0.85, 1.0), density, profile.seen, knots, floor, counted
+    step = part(progress, 0.85, 1.0)
+    strands, more, followed = root_segments(
+        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted
     )
     progress(1, 1)
-    return Guides(strands, profile, tally | more)
+    return Guides(strands, profile, tally | more, followed)
 
 
 def amend_guides(
@@ -145,11 +149,13 @@ def amend_guides(
     progress: Progress = silent,
     knots: np.ndarray | None = None,
     counted: bool = True,
+    followed: float | None = None,
 ) -> Guides:
     """Guide strands from `pieces` of fitted ones (mm) and what is traced in the rest of the scan: both are joined and rooted as
     in `trace_guides`, where the other arguments are explained. Their support is what the scan backs.
 
-    unexplained: makes the scan without what the pieces explain, once the orientation field is needed no more.
+    unexplained: makes the scan without what the pieces explain, once the orientation field is needed no more. followed: the
+    traced guides' own: what is followed back again is no measure of how far hair runs hidden.
     """
     settings = settings or GuideSettings()
     seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
@@ -161,13 +167,13 @@ def amend_guides(
     segments = concatenate([pieces.resampled_by_step(density.spacing), traced])
     floor = data_floor(density, hair_level, head)
     step = part(progress, 0.5, 1.0)
-    strands, tally = root_segments(
-        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted
+    strands, tally, followed = root_segments(
+        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted, followed
     )
     support = support_along(strands, density, hair_level)[1] if len(strands) else np.zeros(0, np.float32)
     progress(1, 1)
     tally = {"pieces": len(pieces), "traced beside them": len(traced)} | tally
-    return Guides(strands.with_attributes(support=support), profile, tally)
+    return Guides(strands.with_attributes(support=support), profile, tally, followed)
 
 
 def root_segments(
@@ -181,8 +187,10 @@ def root_segments(
     knots: np.ndarray | None = None,
     floor: float = 0.0,
     counted: bool = True,
-) -> tuple[Strands, dict[str, int]]:
-    """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; and what became of them.
+    followed: float | None = None,
+) -> tuple[Strands, dict[str, int], float]:
+    """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; what became of them; and
+    how far they were followed back to the scalp, mm, as a rule (`followed`, where given).
 
     scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
     knots: (K, 3) mm, where strands are tied to the net; counted: they are as many as the strands. floor: mm over the scalp
@@ -221,7 +229,8 @@ def root_segments(
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
     made = (bodies.counts - seen.counts)[enough]
-    rooted, tied, late = lead_into_scalp(kept, head, knots, made, part(progress, 0.7, 0.85))
+    followed = usually_followed(kept, made) if followed is None else followed
+    rooted, tied, late = lead_into_scalp(kept, head, knots, made, part(progress, 0.7, 0.85), followed)
     tally["roots at knots of the net"] = tied
     tally["led to knots that were left"] = late
     progress(0.85, 1.0)
@@ -234,7 +243,7 @@ def root_segments(
     support = np.clip(backed_length / np.maximum(rooted.lengths(), 1e-6), 0.0, 1.0).astype(np.float32)
     uv = root.uv.astype(np.float32) if root is not None else np.zeros((0, 2), np.float32)
     progress(1.0, 1.0)
-    return Strands(rooted.points, rooted.offsets, {"support": support, "root_uv": uv}), tally
+    return Strands(rooted.points, rooted.offsets, {"support": support, "root_uv": uv}), tally, followed
 
 
 def _step(spacing: float) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from ct2hair_addon.guides.free_knots import AS_FAR, LEAVING, lead_to_free_knots
+from ct2hair_addon.guides.free_knots import AS_FAR, LEAVING, lead_to_free_knots, usually_followed
 from ct2hair_addon.guides.growing import WALK_STEP, follow_to_scalp, walked_back
 from ct2hair_addon.guides.roots import lead_into_scalp
 from ct2hair_addon.head import Head
@@ -82,6 +83,34 @@ def test_where_hair_stands_up_no_knot_is_looked_for_far_back(ball, stream):
     np.testing.assert_array_equal(led.points, strands.points)
     led, _, tied = lead_to_free_knots(strands, made, rest[:0], knots, ball)
     assert not tied.any() and led is strands
+
+
+def test_what_the_wig_usually_shows_stands_for_what_is_followed_again(ball, stream):
+    strands, made, rest, knots = stream
+    usual = usually_followed(strands, made)
+    assert 10.0 < usual < 16.0 and usually_followed(strands, 0 * made) == 0.0
+    asked, _, tied = lead_to_free_knots(strands, np.minimum(made, 1), rest, knots, ball, usual=usual)
+    assert tied[rest].all()
+    _, _, tied = lead_to_free_knots(strands, made, rest, knots, ball, usual=0.0)
+    assert not tied.any()
+
+
+def test_none_is_led_through_the_air_over_the_hair_that_it_passed(ball):
+    """Hair lies low and lifts off the scalp at once, as before a tail's tie: a strand seen from there on came along under it."""
+
+    def lifting(azimuth: float, start: float) -> np.ndarray:
+        s = np.arange(start, 90.0, WALK_STEP)
+        return place(azimuth, s, 1.0 + 0.02 * s + 0.04 * np.maximum(s - 55.0, 0.0) ** 2)
+
+    late = APART * 5.5
+    knot = np.array(ball.closest_scalp(place(late, [15.0], 0.0)).position, float)
+    strands = Strands.from_polylines([*(lifting(APART * n, 0.0) for n in range(12)), lifting(late, 72.0)])
+    led, _, tied = lead_to_free_knots(strands, np.zeros(13, int), np.array([12]), knot, ball, usual=30.0)
+    assert tied[12]
+    line, hair = led.polylines()[12], np.concatenate(strands.polylines()[:12])
+    passed = ball.signed_distance(line[: -strands.counts[12]])
+    beside = ball.signed_distance(hair)[cKDTree(hair).query(line[: -strands.counts[12]])[1]]
+    assert passed.max() > 5.0 and (passed < beside + 0.7).all()
 
 
 def test_a_way_back_is_no_longer_than_asked_and_otherwise_the_same(ball, stream):

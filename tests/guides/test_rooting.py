@@ -124,7 +124,7 @@ def test_rooted_strands_have_all_that_is_promised(ball):
     rng = np.random.default_rng(0)
     lines = [hair(a, 2, 80) for a in np.linspace(0, 1, 60)]
     lines += [hair(a, 30, 75)[:: rng.choice([-1, 1])] for a in rng.uniform(0, 1, 40)] + [hair(3.0, 40, 60)]
-    guides, tally = root_segments(Strands.from_polylines(lines), 0.4, ball, GuideSettings())
+    guides, tally, _ = root_segments(Strands.from_polylines(lines), 0.4, ball, GuideSettings())
     assert len(guides) == 100 and tally["dropped: no rooted hair near"] == 1
     root = ball.closest_scalp(guides.roots)
     assert root.distance.max() < 0.05
@@ -145,13 +145,13 @@ def test_knots_say_how_many_strands_there_are_only_where_all_of_them_are_found(b
     knots = np.array([hair(a, 0, 1)[0] for a in np.linspace(0, 6, 60)])
     scan = render_density(Strands.from_polylines(lines), 1.0, 1.0)
     made = Strands.from_polylines(lines)
-    guides, tally = root_segments(made, 1.0, ball, GuideSettings(), scan=scan, strand=1.0, knots=knots, counted=counted)
+    guides, tally, _ = root_segments(made, 1.0, ball, GuideSettings(), scan=scan, strand=1.0, knots=knots, counted=counted)
     assert (tally["strands by the knots"], tally["dearest joint allowed"]) == (known, price)
     assert tally["roots at knots of the net"] == len(guides) == 60
 
 
 def test_nothing_found_is_no_guides(ball):
     empty = Strands(np.zeros((0, 3), np.float32), np.zeros(1, np.int64))
-    guides, tally = root_segments(empty, 0.4, ball, GuideSettings())
+    guides, tally, _ = root_segments(empty, 0.4, ball, GuideSettings())
     assert len(guides) == 0 and tally["guides"] == 0
     assert set(guides.strand_attributes) == {"support", "root_uv"}
