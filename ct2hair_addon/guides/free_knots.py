@@ -35,7 +35,7 @@ CHUNK = 4096
 
 
 def usually_followed(strands: Strands, made: np.ndarray) -> float:
-    """The median of how far strands were followed back, mm, of those that were: `made` (N,) points at their roots; 0 if none."""
+    """How far strands were followed back, `made` (N,) points at their roots, mm: the median of those that were; 0 if none."""
     followed = strands.arc_lengths()[strands.offsets[:-1] + made][made > 0]
     return float(np.median(followed)) if len(followed) else 0.0
 

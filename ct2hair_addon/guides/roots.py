@@ -43,8 +43,8 @@ def lead_into_scalp(
     The root lies FOLLOWED_BACK of the way to where the hair around, followed straight back, meets the scalp, or at the knot by
     there, if there is one among `knots` (K, 3), mm (`tie_to_knots`). Where `made` (N,) tells how many points of each strand
     were not traced, those without a knot are led to the ones that are left (`lead_to_free_knots`), and so are those that were
-    followed back over the scalp: they may have passed theirs, `usual` mm and some more. The curve is a cubic Hermite piece that leaves the scalp leaning
-    to its normal; a first point already on the scalp or in the head is moved there.
+    followed back over the scalp: they may have passed theirs (usual: as there). The curve is a cubic Hermite piece that leaves
+    the scalp leaning to its normal; a first point already on the scalp or in the head is moved there.
     """
     if not len(strands):
         return strands, 0, 0

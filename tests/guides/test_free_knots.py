@@ -89,7 +89,7 @@ def test_what_the_wig_usually_shows_stands_for_what_is_followed_again(ball, stre
     strands, made, rest, knots = stream
     usual = usually_followed(strands, made)
     assert 10.0 < usual < 16.0 and usually_followed(strands, 0 * made) == 0.0
-    asked, _, tied = lead_to_free_knots(strands, np.minimum(made, 1), rest, knots, ball, usual=usual)
+    _, _, tied = lead_to_free_knots(strands, np.minimum(made, 1), rest, knots, ball, usual=usual)
     assert tied[rest].all()
     _, _, tied = lead_to_free_knots(strands, made, rest, knots, ball, usual=0.0)
     assert not tied.any()
