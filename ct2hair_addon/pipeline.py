@@ -23,7 +23,7 @@ from . import __version__
 from .checkpoints import Checkpoints, chained_key, fingerprint
 from .errors import CT2HairError
 from .evaluation import write_report
-from .guides import Guides, amend_guides, trace_guides
+from .guides import Guides, amend_guides, strands_by_knots, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .kernels import compiled_ahead
@@ -196,12 +196,13 @@ class _Job:
         wanted = dataclasses.replace(
             settings.refinement, prune=settings.refinement.prune and not settings.interpolation.strands
         )
-        refined = self._stage(
-            "refinement",
-            lambda progress: refine(
-                dense.strands, density, level, head, wanted, seed, progress, device=settings.run.device, peak=lone
-            ),
-        )
+
+        def fit(progress: Progress) -> Refined:
+            known, _ = strands_by_knots(wig.knots if len(wig.solid_points) else None, head, density.spacing)
+            device = settings.run.device
+            return refine(dense.strands, density, level, head, wanted, seed, progress, device=device, peak=lone, fewest=known)
+
+        refined = self._stage("refinement", fit)
         return self._write(wig, registration, head, guides.strands, dense.strands, refined)
 
     def _stop(self, wig: WigScan, registration: Registration | None = None, **strands: Strands) -> None:

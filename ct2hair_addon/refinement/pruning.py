@@ -47,6 +47,7 @@ def prune(
     progress: Progress = silent,
     reach: float = 0.0,
     traced: np.ndarray | None = None,
+    fewest: int = 0,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """(N,) int64: how many control points of each strand stay, 0 for none; and the counts of what went.
 
@@ -54,7 +55,8 @@ def prune(
     another, those that earn least first, each against what the others before it have left; the same on any number of threads.
     reach: voxels by which strands may still be off: scan and rendering are blurred by as much before they are held together,
     so that one beside hair that nothing else explains is kept. traced: (N,) bool, strands that were found in the scan
-    (None: none was); the others are made up.
+    (None: none was); the others are made up. fewest: no traced strand goes where no more than so many are left: they are known
+    to be there, and in a bundle one that takes another's place looks like a double.
     """
     counts = np.diff(offsets)
     kept = counts.copy()
@@ -69,12 +71,12 @@ def prune(
     # what goes makes the others earn more: a strand that stays as it is now needs no second look
     order = np.argsort(earned, kind="stable")
     order = order[~traced[order] | (earned[order] < (0.5 - DOUBLE) * shown[order])]
-    step = 2000
+    left, step = np.array([np.count_nonzero(counts)]), 2000
     for start in range(0, len(order), step):
         progress(0.8 + 0.2 * start / len(order), 1.0)
         _cut(
             density.table, excess, density.bricks, bare, voxels, offsets, visible, order[start : start + step], mark.peak,
-            mark.seen, mark.blur, traced, kept,
+            mark.seen, mark.blur, traced, fewest, left, kept,
         )  # fmt: skip
     progress(1.0, 1.0)
     gone = int(np.count_nonzero((kept == 0) & (counts > 0)))
@@ -189,7 +191,8 @@ def earnings(table, excess, scan, bare, points, offsets, visible, peak, seen):
 
 
 @numba.njit(cache=True, nogil=True)
-def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen, blur, traced, kept):
+def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen, blur, traced, fewest, left, kept):
+    """Judge the strands of `order` one after another (`prune`); left (1,): how many there are still."""
     for n in order:
         start, end = offsets[n], offsets[n + 1]
         size = end - start
@@ -202,7 +205,7 @@ def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen,
             if earned[m] > earned[best]:
                 best = m
         if traced[n]:
-            if earned[size - 1] >= (0.5 - DOUBLE) * shown:
+            if earned[size - 1] >= (0.5 - DOUBLE) * shown or left[0] <= fewest:
                 continue
             stay = 0
         elif earned[best] < LEAST_EARNED:
@@ -212,6 +215,8 @@ def _cut(table, excess, scan, bare, points, offsets, visible, order, peak, seen,
         else:
             continue
         kept[n] = stay
+        if stay == 0:
+            left[0] -= 1
         take_out(table, excess, points, visible, start, end, start + max(stay - 1, 0), end - 1, peak, blur)
 
 

@@ -62,6 +62,7 @@ def refine(
     device: str = "auto",
     peak: float = 0.0,
     final: bool = True,
+    fewest: int = 0,
 ) -> Refined:
     """Fit strands to the scan that they came from: roots stay where they are, curls are kept.
 
@@ -69,7 +70,8 @@ def refine(
     voxel is hair. head: answers `signed_distance(points)` in mm, negative inside. profile: a lone strand's signature,
     measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where none runs alone.
     device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: they are left as fitted,
-    with a point every other voxel, and there are neither support nor scores. The same input and seed give the same bits on
+    with a point every other voxel, and there are neither support nor scores. fewest: how many strands are known to be there:
+    of traced ones none is taken for a double where no more are left. The same input and seed give the same bits on
     any number of threads; a graphics card rounds differently. Raises Cancelled and CT2HairError (cuda asked for, no card).
     """
     settings = settings or RefinementSettings()
@@ -89,7 +91,7 @@ def refine(
     judged = settings.prune and settings.method == "volume"
     if judged and settings.iterations:
         points, offsets, kept, counts = _pruned(
-            points, offsets, kept, density, profile, boundary, part(progress, 0.1, 0.15), MISPLACED
+            points, offsets, kept, density, profile, boundary, part(progress, 0.1, 0.15), MISPLACED, fewest
         )
         tally |= {f"{name}, before fitting": count for name, count in counts.items()}
     if settings.iterations and len(kept):
@@ -109,6 +111,7 @@ def refine(
                 boundary,
                 part(progress, 0.85, 0.88),
                 0.0 if settings.iterations >= SETTLED else MISPLACED,
+                fewest,
             )
             tally |= {f"{name}, after fitting": count for name, count in counts.items()}
         traced = kept.strand_attributes.get("guide")
@@ -131,13 +134,13 @@ def refine(
     return Refined(result, tally, scores)
 
 
-def _pruned(points, offsets, strands, density, profile, boundary, progress, reach=0.0):
+def _pruned(points, offsets, strands, density, profile, boundary, progress, reach, fewest):
     """Control points, offsets and strands without what explains nothing of the scan; and the counts of what went.
 
     Strands with the attribute `guide` were traced in the scan; without it, all are taken for made up.
     """
     traced = strands.strand_attributes.get("guide")
-    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress, reach, traced)
+    stay, tally = prune(points, offsets, boundary.look(points), density, profile, progress, reach, traced, fewest)
     first = np.repeat(offsets[:-1], np.diff(offsets))
     points = points[np.arange(len(points)) - first < np.repeat(stay, np.diff(offsets))]
     alive = stay > 0

@@ -96,7 +96,7 @@ def test_what_the_wig_usually_shows_stands_for_what_is_followed_again(ball, stre
 
 
 def test_none_is_led_through_the_air_over_the_hair_that_it_passed(ball):
-    """Hair lies low and lifts off the scalp at once, as before a tail's tie: a strand seen from there on came along under it."""
+    """Hair lies low, then lifts off the scalp, as before a tail's tie: a strand seen from there on came along under it."""
 
     def lifting(azimuth: float, start: float) -> np.ndarray:
         s = np.arange(start, 90.0, WALK_STEP)

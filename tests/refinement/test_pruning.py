@@ -22,7 +22,9 @@ def line(x: float, low: float = 0.0, high: float = LENGTH) -> Strands:
     return Strands.from_array(points[None].astype(np.float32))
 
 
-def pruned(hair: Strands, strands: Strands, reach: float = 0.0, traced: list[bool] | None = None) -> np.ndarray:
+def pruned(
+    hair: Strands, strands: Strands, reach: float = 0.0, traced: list[bool] | None = None, fewest: int = 0
+) -> np.ndarray:
     """How many of its points each of `strands` keeps over a scan that shows `hair`."""
     scan = render_density(concatenate([hair, line(-20.0, -10.0, 50.0)]), VOXEL, BLUR)
     kept, tally = prune(
@@ -33,6 +35,7 @@ def pruned(hair: Strands, strands: Strands, reach: float = 0.0, traced: list[boo
         PROFILE,
         reach=reach,
         traced=None if traced is None else np.array(traced),
+        fewest=fewest,
     )
     assert tally[REMOVED] == np.count_nonzero(kept == 0)
     assert tally[CUT_BACK] == np.count_nonzero((kept > 0) & (kept < strands.counts))
@@ -60,6 +63,14 @@ def test_a_traced_strand_goes_only_where_it_doubles_others_all_along():
     scan = concatenate([hair, Strands.from_array(parting.points[None, 20:])])
     assert 0 in pruned(scan, both)
     assert pruned(scan, both, traced=[True, True]).tolist() == [41, 41]
+
+
+def test_where_no_more_traced_ones_are_left_than_are_known_none_goes_but_made_up_ones():
+    hair, three = line(0.0), concatenate([line(0.0), line(0.1), line(0.2)])
+    for fewest, left in ((0, 1), (1, 1), (2, 2), (3, 3), (9, 3)):
+        assert np.count_nonzero(pruned(hair, three, traced=[True] * 3, fewest=fewest)) == left
+    stay = pruned(hair, concatenate([three, line(8.0)]), traced=[True, True, True, False], fewest=3)
+    assert stay.tolist() == [41, 41, 41, 0]
 
 
 def test_two_where_the_scan_shows_two_stay():
