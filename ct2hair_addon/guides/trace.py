@@ -1,9 +1,8 @@
 """Following strands through the density and taking each found one out, so that its neighbour shows.
 
 In place of the paper's mean shift and Euler steps (3.2.2): segments come straight from the density. A batch of seeds is
-followed in parallel through the
-same residual; then, in the batch's order, each path is held against what the earlier ones have left, and what stands is
-subtracted.
+followed in parallel through the same residual; then, in the batch's order, each path is held against what the earlier ones
+have left, and what stands is subtracted.
 """
 
 from __future__ import annotations
@@ -185,8 +184,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
 @numba.njit(cache=True, nogil=True)
 def smoothed(path, widths, most):
     """The path under a local quadratic: at each point the widest of the windows (half-widths, rising) whose fit stays within
-    `most`
-    (root mean square, in the path's unit) of the points. Long windows for smooth hair, short ones for curls."""
+    `most` (root mean square, in the path's unit) of the points. Long windows for smooth hair, short ones for curls."""
     size = len(path)
     out = path.copy()
     m0, m1, m2, f0 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -328,8 +326,7 @@ def _trace(
 @numba.njit(cache=True, nogil=True)
 def _settle(table, bricks, paths, firsts, counts, ends, seen, peak, blur, shortest, first, last):
     """In order: cut each path to what the residual still backs around its seed and subtract it. firsts, counts and ends are
-    updated;
-    a path that is not kept has both counts at -1."""
+    updated; a path that is not kept has both counts at -1."""
     window = 4
     for n in range(first, last):
         middle = firsts[n] + counts[n, 0]
