@@ -64,6 +64,7 @@ def remove_hairnet(
             solid.dipole,
             solid.radius,
             *head.sides,
+            head.walls,
             scalp.boxes,
             scalp.child,
             scalp.first,
@@ -110,6 +111,7 @@ def _remove(
     radius,
     low,
     sides,
+    walls,
     scalp_boxes,
     scalp_child,
     scalp_first,
@@ -126,9 +128,11 @@ def _remove(
         y0 = origin[1] + BRICK * index[b, 1] * spacing
         z0 = origin[2] + BRICK * index[b, 2] * spacing
         x, y, z = x0 + half, y0 + half, z0 + half
-        _, slot, _, _ = nearest_one(boxes, child, first, count, corners, x, y, z, far * far)
+        _, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, far * far)
         near = slot >= 0
-        whole = not near and inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, x, y, z)
+        whole = not near and inside_one(
+            boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z
+        )
         if not near and not whole:
             continue
         head = np.full((size + 1, size + 1, size + 1), -1.0)
@@ -140,14 +144,14 @@ def _remove(
                 for j in range(size + 1):
                     for k in range(size + 1):
                         x, y, z = x0 + i * step, y0 + j * step, z0 + k * step
-                        d2, _, _, _ = nearest_one(boxes, child, first, count, corners, x, y, z, 4.0 * far * far)
+                        d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, 4.0 * far * far)
                         s2, _, _, _ = nearest_one(
                             scalp_boxes, scalp_child, scalp_first, scalp_count, scalp_corners, x, y, z, 4.0 * far * far
                         )
-                        side = 1.0
-                        if inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, x, y, z):
-                            side = -1.0
-                        head[i, j, k] = side * np.sqrt(d2)
+                        inside = inside_one(
+                            boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z
+                        )
+                        head[i, j, k] = -np.sqrt(d2) if inside else np.sqrt(d2)
                         beyond[i, j, k] = np.sqrt(s2) - np.sqrt(d2)
         left = 0
         for i in range(BRICK):

@@ -229,15 +229,19 @@ def closed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @numba.njit(cache=True)
-def inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, x, y, z):
-    """Whether a point is inside: as its nearest grid node, if the node's own empty ball holds it, else by winding number."""
+def inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z):
+    """Whether a point is inside: as its nearest grid node, if the node's own empty ball holds it; as its nearest triangle says
+    (slot, v, w of `nearest_one`; -1 where none is known), if that is a wall and nearest within its edges; else by winding
+    number."""
     if x < boxes[0, 0] or y < boxes[0, 1] or z < boxes[0, 2] or x > boxes[0, 3] or y > boxes[0, 4] or z > boxes[0, 5]:
         return False
-    i, j, k = int((x - low[0]) / SIDES + 0.5), int((y - low[1]) / SIDES + 0.5), int((z - low[2]) / SIDES + 0.5)
+    i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
     dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
     node = sides[i, j, k]
     if dx * dx + dy * dy + dz * dz < node * node:
         return node < 0.0
+    if slot >= 0 and walls[slot] and v > 0.0 and w > 0.0 and v + w < 1.0:
+        return _behind(corners, slot, x, y, z)
     return winding_one(boxes, child, first, count, corners, centre, dipole, radius, x, y, z) > 0.5
 
 
@@ -259,14 +263,7 @@ def _signed_distance(
             continue
         # no farther than the nearest grid node's distance allows: most of the tree is never visited
         d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, (abs(node) + off + 1e-3) ** 2)
-        if box2 > 0.0:
-            inside = False
-        elif off < abs(node):
-            inside = node < 0.0
-        elif slot >= 0 and walls[slot] and v > 0.0 and w > 0.0 and v + w < 1.0:
-            inside = _behind(corners, slot, x, y, z)
-        else:
-            inside = winding_one(boxes, child, first, count, corners, centre, dipole, radius, x, y, z) > 0.5
+        inside = inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z)
         out[n] = -np.sqrt(d2) if inside else np.sqrt(d2)
 
 
