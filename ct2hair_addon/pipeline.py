@@ -198,7 +198,8 @@ class _Job:
         )
 
         def fit(progress: Progress) -> Refined:
-            known, _ = strands_by_knots(wig.knots if len(wig.solid_points) else None, head, density.spacing)
+            trusted = settings.guides.knots and wig.counted
+            known, _ = strands_by_knots(wig.knots if trusted else None, head, density.spacing)
             device = settings.run.device
             return refine(dense.strands, density, level, head, wanted, seed, progress, device=device, peak=lone, fewest=known)
 
@@ -276,7 +277,6 @@ class _Job:
         """Traced guides, amended as often as the settings want it; what there is before each amendment is kept until all are
         done."""
         settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
-        counted = len(wig.solid_points) > 0
         rounds = settings.guides.amend if settings.guides.method == "trace" else 0
         share = 1.0 / (1.0 + AMENDING * rounds)
         keys = [chained_key(self.keys["guides"], amended=number) for number in range(rounds)]
@@ -286,9 +286,7 @@ class _Job:
             guides = self.checkpoints.load(TRACED, keys[done])
         if guides is None:
             step = part(progress, 0.0, share)
-            guides = trace_guides(
-                density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, counted=counted
-            )
+            guides = trace_guides(density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, wig.counted)
             if rounds:
                 self.checkpoints.save(TRACED, keys[0], guides)
         fields.clear()
@@ -296,12 +294,12 @@ class _Job:
         del guides
         for number in range(done, rounds if len(held[0].strands) else 0):
             step = part(part(progress, share, 1.0), number / rounds, (number + 1) / rounds)
-            held.append(self._amended(held, number + 1, wig, density, head, step, counted))
+            held.append(self._amended(held, number + 1, wig, density, head, step))
             if number + 1 < rounds:
                 self.checkpoints.save(TRACED, keys[number + 1], held[0])
         return held.pop()
 
-    def _amended(self, held: list[Guides], number: int, wig, density, head, progress: Progress, counted: bool) -> Guides:
+    def _amended(self, held: list[Guides], number: int, wig, density, head, progress: Progress) -> Guides:
         """The guides, taken out of `held`, fitted to the scan; what they have too many cut out, what they lack traced anew."""
         settings, seed, level, lone = self.settings, self.settings.run.seed, wig.hair_level, wig.thresholds.strand
         guides = held.pop()
@@ -323,10 +321,10 @@ class _Job:
         step, wanted = part(progress, 0.75, 1.0), settings.guides
         rest = partial(unexplained, pieces, density, level, head, profile)
         amended = amend_guides(
-            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, counted, followed
+            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, wig.counted, followed
         )
         tally = {f"amended {number}: {name}": count for name, count in (counts | amended.tally).items()}
-        return Guides(amended.strands, usual, known | tally, followed)
+        return dataclasses.replace(amended, profile=usual, tally=known | tally)
 
     def _write(
         self, wig: WigScan, registration: Registration, head: Head, guides: Strands, dense: Strands, refined: Refined

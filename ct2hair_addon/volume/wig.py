@@ -83,6 +83,11 @@ class WigScan:
     tally: dict[str, int]
     warnings: tuple[str, ...] = ()
 
+    @property
+    def counted(self) -> bool:
+        """Whether the knots are as many as the strands: all are found by a mannequin's skin; without one they are few."""
+        return len(self.solid_points) > 0
+
 
 def import_scan(
     reader: ScanReader, thresholds: Thresholds, settings: ScanSettings | None = None, progress: Progress = silent
