@@ -286,7 +286,9 @@ class _Job:
             guides = self.checkpoints.load(TRACED, keys[done])
         if guides is None:
             step = part(progress, 0.0, share)
-            guides = trace_guides(density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, wig.counted)
+            guides = trace_guides(
+                density, level, fields.pop(), head, settings.guides, seed, step, wig.knots, lone, counted=wig.counted
+            )
             if rounds:
                 self.checkpoints.save(TRACED, keys[0], guides)
         fields.clear()
