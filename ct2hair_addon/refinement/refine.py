@@ -26,7 +26,7 @@ CHAMFER_SEGMENT = 6.0
 closer ones."""
 SETTLED = 15
 """Iterations after which strands are where they belong."""
-EXCHANGES, EXCHANGED_SHARE, LEAST_BETWEEN = 3, 0.36, 4
+EXCHANGES, EXCHANGED_SHARE, LEAST_BETWEEN = 3, 0.4, 3
 """How often tips are exchanged, the share of all iterations before the last of these, and how many lie between two at least."""
 FIRST_SHARE = 0.24
 """Share of the iterations before them."""
