@@ -9,6 +9,7 @@ loose says how many strands there are; where the knots of the hairnet tell that,
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -34,9 +35,17 @@ SHORTEST = 12
 ACROSS = 4.0
 """voxel to both sides of a cut that are left out when its going straight on is weighed: smoothing hides a hop."""
 STATIONS = ((2.0, 3.5), (7.0, 4.5), (14.0, 5.5), (23.0, 7.0), (34.0, 8.5))
-"""voxel; root ends are looked for around these points ahead of a tip, within these radii."""
+"""voxel; root ends are looked for around these points ahead of a tip, along its bend, within these radii."""
+STRAIGHT = 10.0
+"""voxel; and straight ahead of it as well where it is farther than this: nearer, both places are one."""
 NEAREST = 12
-"""Root ends looked at around each station."""
+"""Ends looked at around each station; twice as many where those of all CUTS lie there."""
+MEETS = 16.0
+"""Cost from which on a joint says nothing of which way its two pieces run."""
+HELD = 64
+"""Joints held of a tip, the cheapest: what is best comes out within a ten-thousandth of what it costs as of all of them."""
+BLOCK = 20_000
+"""Tips looked at at once: what bounds memory."""
 SPAN = 12.0
 """voxel; the length at an end that its course is fitted to."""
 PLACE = (2.0, 0.1)
@@ -236,15 +245,10 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     valid, place, out, bend = ends
     usable = np.flatnonzero(valid)
     tree = cKDTree(place[usable])
-    pairs = []
-    for ahead, radius in STATIONS[:NEAR_STATIONS]:
-        for bent in (0.0, 0.5):
-            centre = place[usable] + ahead * out[usable] + bent * ahead**2 * bend[usable]
-            near = tree.query(centre, k=min(NEAREST, len(usable)), distance_upper_bound=radius, workers=-1)[1]
-            row, column = np.nonzero(near.reshape(len(usable), -1) < len(usable))
-            one, other = usable[row], usable[near.reshape(len(usable), -1)[row, column]]
-            pairs.append(np.minimum(one, other) * (2 * count) + np.maximum(one, other))
-    pair = np.unique(np.concatenate(pairs))
+    near = _ahead(tree, usable, (place, out, bend), STATIONS[:NEAR_STATIONS], NEAREST)
+    row, column = np.nonzero(near < len(usable))
+    one, other = usable[row], usable[near[row, column]]
+    pair = np.unique(np.minimum(one, other) * (2 * count) + np.maximum(one, other))
     one, other = pair // (2 * count), pair % (2 * count)
     # an end of one piece at the beginning of the next is weighed as a cut
     kept = (one % count != other % count) & (onward[one % count] != other % count) & (onward[other % count] != one % count)
@@ -252,12 +256,12 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     cost = np.empty(len(one))
     _weigh(
         one, other, place, out, bend, place, out, bend, density.table, density.bricks, density.origin / voxel,
-        np.float32(strand), LOOSE_END, cost,
+        np.float32(strand), MEETS, cost,
     )  # fmt: skip
-    kept = cost < LOOSE_END
+    kept = cost < MEETS
     one, other = one[kept], other[kept]
     sign = np.where((one < count) == (other < count), -1.0, 1.0)
-    pair, _, healed = _healed(lines, onward, density, strand)
+    pair, healed = _healed(lines, onward, density, strand)
     pairs = np.stack([np.append(one % count, pair // count), np.append(other % count, pair % count)], axis=1)
     return pairs, np.append(sign, np.ones(len(pair))), np.append(cost[kept], healed)
 
@@ -330,68 +334,94 @@ def _candidates(
     dearest: float,
     progress: Progress,
 ) -> _Joints:
-    """All joints no dearer than `dearest`, the cheapest for each pair; those that heal a cut leave nothing off."""
+    """The joints no dearer than `dearest`, the HELD cheapest of each tip; those that heal a cut are all held and leave nothing
+    off. Of a pair that may be joined by more than one cut, the cheapest."""
     voxel, count = density.spacing, len(lines)
-    best = _healed(lines, onward, density, strand)
-    number, steps = 0, len(CUTS) ** 2
-    for root_cut in CUTS:
-        root_valid, root_place, root_out, root_bend = _courses(lines, True, root_cut, voxel)
-        targets = np.flatnonzero(root_valid & ~rooted)
-        if not len(targets):
-            continue
-        tree = cKDTree(root_place[targets])
+    held = np.zeros(count, np.int32), np.empty((count, HELD), np.int32), np.empty((count, HELD), np.float32)
+    number, roots, costs = held
+    cuts = np.zeros((count, HELD, 2), np.int8)
+    pair, healed = _healed(lines, onward, density, strand)
+    tip = pair // count
+    number[tip], roots[tip, 0], costs[tip, 0] = 1, pair % count, healed
+    valid, *root_courses = (np.concatenate(of) for of in zip(*(_courses(lines, True, cut, voxel) for cut in CUTS), strict=True))
+    # the number of a root end: its piece, and `count` more for each cut
+    targets = np.flatnonzero(valid & ~np.tile(rooted, len(CUTS)))
+    left = np.round(np.array(CUTS) / STEP).astype(np.int64)
+    done = 0
+    if len(targets):
+        tree = cKDTree(root_courses[0][targets])
         for cut in CUTS:
-            progress(number, steps)
-            number += 1
-            valid, place, out, bend = _courses(lines, False, cut, voxel)
-            tips = np.flatnonzero(valid)
-            if not len(tips):
+            valid, *courses = _courses(lines, False, cut, voxel)
+            for wanted, stations in ((onward >= 0, STATIONS[:NEAR_STATIONS]), (onward < 0, STATIONS)):
+                tips = np.flatnonzero(valid & wanted)
+                for some in np.array_split(tips, max(-(-len(tips) // BLOCK), 1)):
+                    ends = np.append(targets, -1)[_ahead(tree, some, courses, stations, 2 * NEAREST)]
+                    _hold(
+                        some, ends, onward, *courses, *root_courses, density.table, density.bricks, density.origin / voxel,
+                        np.float32(strand), dearest, round(cut / STEP), left, *held, cuts,
+                    )  # fmt: skip
+                    done += len(some)
+                    progress(done, count * len(CUTS))
+    row = np.repeat(np.arange(count), number)
+    column = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+    key = row * count + roots[row, column]
+    order = np.argsort(key)
+    row, column = row[order], column[order]
+    return _Joints(row, roots[row, column].astype(np.int64), cuts[row, column], costs[row, column].astype(np.float64))
+
+
+def _ahead(tree: cKDTree, tips: np.ndarray, course: Sequence[np.ndarray], stations, nearest: int) -> np.ndarray:
+    """(T, K) int64: what of the tree lies around the stations ahead of each of the tips; its size where that is not so much."""
+    near, (place, out, bend) = [], course
+    for ahead, radius in stations:
+        for bent in (0.5,) if ahead < STRAIGHT else (0.5, 0.0):
+            centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
+            near.append(tree.query(centre, k=nearest, distance_upper_bound=radius, workers=-1)[1])
+    return np.concatenate(near, axis=1)
+
+
+@numba.njit(cache=True, parallel=True)
+def _hold(
+    tips, ends, onward, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, dearest, cut,
+    root_cuts, number, roots, costs, cuts,
+):  # fmt: skip
+    """Weigh the joints of each tip with the root ends (T, K) beside it (each any number of times, -1 for none), and hold the
+    cheapest: of a piece's tip `number` (P,), their `roots`, `costs` and `cuts` (P, HELD). The first stays if it heals a cut."""
+    count, room = len(onward), roots.shape[1]
+    for n in numba.prange(len(tips)):
+        a, last = tips[n], -1
+        first = 1 if onward[a] >= 0 else 0
+        for end in np.sort(ends[n]):
+            b = end % count
+            if end == last or end < 0 or b == a or b == onward[a]:
                 continue
-            pairs = []
-            for station, (ahead, radius) in enumerate(STATIONS):
-                if station == NEAR_STATIONS:
-                    tips = tips[onward[tips] < 0]
-                for bent in (0.0, 0.5):
-                    centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
-                    near = tree.query(centre, k=min(NEAREST, len(targets)), distance_upper_bound=radius, workers=-1)[1]
-                    near = near.reshape(len(tips), -1)
-                    row, column = np.nonzero(near < len(targets))
-                    pairs.append(tips[row].astype(np.int64) * count + targets[near[row, column]])
-            pair = np.unique(np.concatenate(pairs))
-            pair = pair[(pair // count != pair % count) & (onward[pair // count] != pair % count)]
-            tip, root = pair // count, pair % count
-            cost = np.empty(len(tip))
-            _weigh(
-                tip, root, place, out, bend, root_place, root_out, root_bend, density.table, density.bricks,
-                density.origin / voxel, np.float32(strand), dearest - PER_CUT * (cut + root_cut), cost,
-            )  # fmt: skip
-            cost += PER_CUT * (cut + root_cut)
-            kept = cost < dearest
-            left = np.full((int(kept.sum()), 2), (round(cut / STEP), round(root_cut / STEP)), np.int16)
-            best = _cheaper(best, (pair[kept], left, cost[kept]))
-    pair, cut, cost = best
-    return _Joints(pair // count, pair % count, cut, cost)
-
-
-def _cheaper(best, more):
-    """Two lots of joints (pairs, ascending, each once; cut; cost) as one; of a pair in both, the cheaper, else the first's.
-
-    Lot by lot, memory holds each pair once.
-    """
-    pair, cut, cost = best
-    if not len(pair):
-        return more
-    place = np.minimum(np.searchsorted(pair, more[0]), len(pair) - 1)
-    known = pair[place] == more[0]
-    won = np.flatnonzero(known)[more[2][known] < cost[place[known]]]
-    cut[place[won]], cost[place[won]] = more[1][won], more[2][won]
-    new = np.flatnonzero(~known)
-    place = np.searchsorted(pair, more[0][new])
-    return tuple(np.insert(old, place, some[new], axis=0) for old, some in zip(best, more, strict=True))
+            last = end
+            slot, worst = -1, first
+            for k in range(first, number[a]):
+                if roots[a, k] == b:
+                    slot = k
+                if costs[a, k] > costs[a, worst]:
+                    worst = k
+            most = dearest
+            if slot >= 0:
+                most = float(costs[a, slot])
+            elif number[a] == room:
+                slot, most = worst, float(costs[a, worst])
+            price = PER_CUT * STEP * (cut + root_cuts[end // count])
+            cost = price + _joint(
+                a, end, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, most - price
+            )
+            if cost >= most:
+                continue
+            if slot < 0:
+                slot = number[a]
+                number[a] += 1
+            roots[a, slot], costs[a, slot] = b, cost
+            cuts[a, slot, 0], cuts[a, slot, 1] = cut, root_cuts[end // count]
 
 
 def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: float):
-    """The joints that heal a cut (pairs, cut, cost), weighed by how the courses at some distance to both sides of it meet."""
+    """The joints that heal a cut (pairs, cost), weighed by how the courses at some distance to both sides of it meet."""
     voxel = density.spacing
     tip = np.flatnonzero(onward >= 0)
     root = onward[tip]
@@ -405,63 +435,68 @@ def _healed(lines: Strands, onward: np.ndarray, density: BrickVolume, strand: fl
         density.origin / voxel, np.float32(strand), np.inf, some,
     )  # fmt: skip
     cost[both] = np.clip(some - PER_VOXEL * 2.0 * ACROSS, 0.0, 0.9 * LOOSE_END)
-    return tip * len(lines) + root, np.zeros((len(tip), 2), np.int16), cost
+    return tip * len(lines) + root, cost
 
 
 @numba.njit(cache=True, parallel=True)
 def _weigh(tip, root, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, most, cost):
-    """The cost of each joint (see the constants): the two courses, extended to the middle of the gap, must meet. Of one dearer
-    than `most` no more than that is told."""
+    """`_joint` of each of many."""
     for n in numba.prange(len(tip)):
-        a, b = tip[n], root[n]
-        gap = 0.0
-        forward = 0.0
+        cost[n] = _joint(
+            tip[n], root[n], place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, most
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _joint(a, b, place, out, bend, root_place, root_out, root_bend, table, bricks, origin, strand, most):
+    """The cost of joining tip a to root end b (see the constants): the two courses, extended to the middle of the gap, must
+    meet. Of one dearer than `most` no more than that is told."""
+    gap = 0.0
+    forward = 0.0
+    for axis in range(3):
+        apart = root_place[b, axis] - place[a, axis]
+        gap += apart * apart
+        forward += apart * (out[a, axis] - root_out[b, axis]) * 0.5
+    gap = np.sqrt(gap)
+    if forward < -1.0 or forward < 0.5 * gap - 1.5:
+        return 1e9
+    half = 0.5 * max(forward, 0.0)
+    best = 1e9
+    for curved in range(2):
+        miss = turn = 0.0
+        norm_a = norm_b = dot = 0.0
         for axis in range(3):
-            apart = root_place[b, axis] - place[a, axis]
-            gap += apart * apart
-            forward += apart * (out[a, axis] - root_out[b, axis]) * 0.5
-        gap = np.sqrt(gap)
-        if forward < -1.0 or forward < 0.5 * gap - 1.5:
-            cost[n] = 1e9
-            continue
-        half = 0.5 * max(forward, 0.0)
-        best = 1e9
-        for curved in range(2):
-            miss = turn = 0.0
-            norm_a = norm_b = dot = 0.0
-            for axis in range(3):
-                pa, ta = place[a, axis] + half * out[a, axis], out[a, axis]
-                pb, tb = root_place[b, axis] + half * root_out[b, axis], root_out[b, axis]
-                if curved:
-                    pa += 0.5 * half * half * bend[a, axis]
-                    pb += 0.5 * half * half * root_bend[b, axis]
-                    ta += half * bend[a, axis]
-                    tb += half * root_bend[b, axis]
-                miss += (pa - pb) ** 2
-                norm_a += ta * ta
-                norm_b += tb * tb
-                dot -= ta * tb
-            turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
-            value = miss / (PLACE[0] + PLACE[1] * gap) ** 2 + (turn / (TURN[0] + TURN[1] * gap)) ** 2
-            best = min(best, value)
-        jump = 0.0
-        for axis in range(3):
-            jump += (bend[a, axis] - root_bend[b, axis]) ** 2
-        best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
-        if best > most:
-            cost[n] = best
-            continue
-        backed = 0.0
-        many = int(gap) + 1
-        for m in range(many):
-            t = (m + 0.5) / many
-            wa, wb = 2 * t**3 - 3 * t**2 + 1, 3 * t**2 - 2 * t**3
-            va, vb = (t**3 - 2 * t**2 + t) * gap, (t**3 - t**2) * gap
-            x = wa * place[a, 0] + va * out[a, 0] + wb * root_place[b, 0] - vb * root_out[b, 0] - origin[0]
-            y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
-            z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
-            backed += min(max(density_at(table, bricks, x, y, z) / strand, 0.0), 1.0)
-        cost[n] = best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
+            pa, ta = place[a, axis] + half * out[a, axis], out[a, axis]
+            pb, tb = root_place[b, axis] + half * root_out[b, axis], root_out[b, axis]
+            if curved:
+                pa += 0.5 * half * half * bend[a, axis]
+                pb += 0.5 * half * half * root_bend[b, axis]
+                ta += half * bend[a, axis]
+                tb += half * root_bend[b, axis]
+            miss += (pa - pb) ** 2
+            norm_a += ta * ta
+            norm_b += tb * tb
+            dot -= ta * tb
+        turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
+        value = miss / (PLACE[0] + PLACE[1] * gap) ** 2 + (turn / (TURN[0] + TURN[1] * gap)) ** 2
+        best = min(best, value)
+    jump = 0.0
+    for axis in range(3):
+        jump += (bend[a, axis] - root_bend[b, axis]) ** 2
+    best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
+    if best > most:
+        return best
+    backed = 0.0
+    many = int(gap) + 1
+    for m in range(many):
+        t = (m + 0.5) / many
+        wa, wb = 2 * t**3 - 3 * t**2 + 1, 3 * t**2 - 2 * t**3
+        va, vb = (t**3 - 2 * t**2 + t) * gap, (t**3 - t**2) * gap
+        x = wa * place[a, 0] + va * out[a, 0] + wb * root_place[b, 0] - vb * root_out[b, 0] - origin[0]
+        y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
+        z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]
+        backed += min(max(density_at(table, bricks, x, y, z) / strand, 0.0), 1.0)
+    return best + UNBACKED * (1.0 - backed / many) * min(gap / 4.0, 1.0)
 
 
 def _assigned(count: int, joints: _Joints, prices: tuple[float, ...], known: int) -> tuple[np.ndarray, np.ndarray, float]:

@@ -110,6 +110,40 @@ def test_a_trace_that_hopped_is_cut_and_each_strand_gets_its_own():
     assert len(chains) == 2
 
 
+def test_of_each_tip_the_cheapest_joints_are_held(monkeypatch):
+    """A bundle that is cut through: each tip may go on in many root ends; one strand in it has a cut of its own to heal."""
+    generator = np.random.default_rng(5)
+    x = np.arange(0.0, 16.0, 0.25)[:, None]
+    places = np.concatenate([np.zeros((40, 1)), generator.uniform(0.0, 3.0, (40, 2))], axis=1)
+    lines = [place + x * [1.0, 0, 0] + shift for shift in ([0.0, 0, 0], [17.0, 0, 0]) for place in places]
+    density = render_density(Strands.from_polylines(lines), SPACING, BLUR)
+    strands = Strands.from_polylines(lines).resampled_by_step(SPACING)
+    onward = np.full(len(lines), -1)
+    onward[3] = 60  # no neighbour of its own place: dear, and yet kept
+
+    def found():
+        return linking._candidates(strands, np.zeros(len(lines), bool), onward, density, SEEN, 30.0, lambda *a: None)
+
+    whole = found()
+    many = np.bincount(whole.tip, minlength=len(lines))
+    assert many[:40].max() <= linking.HELD and np.median(many[:40]) > 8
+    assert (np.diff(whole.tip * len(lines) + whole.root) > 0).all(), "each pair once, in order"
+    monkeypatch.setattr(linking, "BLOCK", 7)
+    for field in ("tip", "root", "cut", "cost"):
+        np.testing.assert_array_equal(getattr(found(), field), getattr(whole, field))
+    monkeypatch.setattr(linking, "HELD", 5)
+    few = found()
+    for tip in range(40):
+        of_all, of_few = whole.tip == tip, few.tip == tip
+        if tip == 3:
+            assert 60 in few.root[of_few] and of_few.sum() == 5
+            healed = of_few & (few.root == 60)
+            assert few.cut[healed].tolist() == [[0, 0]]
+            of_all, of_few = of_all & (whole.root != 60), of_few & (few.root != 60)
+        cheapest = np.sort(whole.cost[of_all])[: 4 if tip == 3 else 5]
+        np.testing.assert_array_equal(np.sort(few.cost[of_few]), cheapest)
+
+
 def test_a_curl_that_turns_over_at_once_is_cut_there():
     angle = np.linspace(0, 3.0, 160)
     arc = 6.0 * np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.3 * angle], axis=1)
