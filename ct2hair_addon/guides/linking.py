@@ -42,8 +42,8 @@ NEAREST = 12
 """Ends looked at around each station; twice as many where those of all CUTS lie there."""
 MEETS = 16.0
 """Cost from which on a joint says nothing of which way its two pieces run."""
-HELD = 64
-"""Joints held of a tip, the cheapest: what is best comes out within a ten-thousandth of what it costs as of all of them."""
+HELD = 96
+"""Joints held of a tip, the cheapest: what they cost comes out within a ten-thousandth of what it does with all."""
 BLOCK = 20_000
 """Tips looked at at once: what bounds memory."""
 SPAN = 12.0
