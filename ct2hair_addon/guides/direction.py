@@ -70,7 +70,7 @@ def signs(
 
     Fine strands are sure. The others take the sign that agrees best with their neighbours along the hair: the mean-field
     solution of a signed graph of strands, an edge the summed agreement of their neighbouring points' tangents. meeting: pairs
-    of strands whose ends meet, with sign and cost (`linking.meeting_ends`): edges too, since hair goes on as it came.
+    of strands whose ends meet, with sign and cost (`joints.meeting_ends`): edges too, since hair goes on as it came.
     """
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ..head import Head, ScalpPoints
 from ..strands import normalized
-from .linking import assign
+from .assignment import assign
 
 HEIGHT = 1.0
 """mm; knots this far over or under the scalp at most."""

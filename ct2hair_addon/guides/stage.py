@@ -17,9 +17,11 @@ from ..volume.strand_signal import StrandProfile, data_floor, support_along
 from .direction import fine_ends, signs
 from .free_knots import usually_followed
 from .growing import follow_to_scalp, grow_to_root
+from .joints import meeting_ends
 from .knots import strands_by_knots
-from .linking import cut_segments, link_segments, meeting_ends
+from .linking import link_segments
 from .paper import paper_guides
+from .pieces import cut_segments
 from .profile import strand_profile
 from .roots import lead_into_scalp, push_out
 from .seeds import Seeds, seed_order, seed_voxels

@@ -8,8 +8,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from ct2hair_addon.evaluation import render_density, strand_peak
-from ct2hair_addon.guides import linking
-from ct2hair_addon.guides.linking import assign, cut_segments, link_segments, meeting_ends
+from ct2hair_addon.guides import joints, linking
+from ct2hair_addon.guides.assignment import assign
+from ct2hair_addon.guides.joints import meeting_ends, weighed_joints
+from ct2hair_addon.guides.linking import link_segments
+from ct2hair_addon.guides.pieces import cut_segments
 from ct2hair_addon.strands import Strands
 
 SPACING, BLUR = 0.4, 0.85
@@ -122,16 +125,16 @@ def test_of_each_tip_the_cheapest_joints_are_held(monkeypatch):
     onward[3] = 60  # no neighbour of its own place: dear, and yet kept
 
     def found():
-        return linking._candidates(strands, np.zeros(len(lines), bool), onward, density, SEEN, 30.0, lambda *a: None)
+        return weighed_joints(strands, np.zeros(len(lines), bool), onward, density, SEEN, 30.0, lambda *a: None)
 
     whole = found()
     many = np.bincount(whole.tip, minlength=len(lines))
-    assert many[:40].max() <= linking.HELD and np.median(many[:40]) > 8
+    assert many[:40].max() <= joints.HELD and np.median(many[:40]) > 8
     assert (np.diff(whole.tip * len(lines) + whole.root) > 0).all(), "each pair once, in order"
-    monkeypatch.setattr(linking, "BLOCK", 7)
+    monkeypatch.setattr(joints, "BLOCK", 7)
     for field in ("tip", "root", "cut", "cost"):
         np.testing.assert_array_equal(getattr(found(), field), getattr(whole, field))
-    monkeypatch.setattr(linking, "HELD", 5)
+    monkeypatch.setattr(joints, "HELD", 5)
     few = found()
     for tip in range(40):
         of_all, of_few = whole.tip == tip, few.tip == tip
