@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..progress import Progress
+from ..progress import Progress, silent
 from ..strands import Strands
 from ..volume.grid import BrickVolume
 from .pieces import STEP, Pieces
@@ -72,7 +72,7 @@ def weighed_joints(
     density: BrickVolume,
     strand: float,
     dearest: float,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Joints:
     """The joints no dearer than `dearest`, of each tip the HELD cheapest; sorted by tip and root, each pair once.
 
@@ -93,16 +93,16 @@ def weighed_joints(
     left = np.round(np.array(CUTS) / STEP).astype(np.int64)
     done = 0
     if len(targets):
-        tree = cKDTree(root_courses[0][targets])
-        for cut in CUTS:
+        tree, found = cKDTree(root_courses[0][targets]), np.append(targets, -1)
+        for cut, points in zip(CUTS, left, strict=True):
             valid, *courses = _courses(lines, False, cut, voxel)
             for wanted, stations in ((onward >= 0, STATIONS[:NEAR_STATIONS]), (onward < 0, STATIONS)):
                 tips = np.flatnonzero(valid & wanted)
                 for some in np.array_split(tips, max(-(-len(tips) // BLOCK), 1)):
-                    ends = np.append(targets, -1)[_ahead(tree, some, courses, stations, 2 * NEAREST)]
+                    ends = found[_ahead(tree, some, courses, stations, 2 * NEAREST)]
                     _hold(
                         some, ends, onward, *courses, *root_courses, density.table, density.bricks, density.origin / voxel,
-                        np.float32(strand), dearest, round(cut / STEP), left, *held, cuts,
+                        np.float32(strand), dearest, points, left, *held, cuts,
                     )  # fmt: skip
                     done += len(some)
                     progress(done, count * len(CUTS))
@@ -122,11 +122,10 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     """
     voxel, lines, onward = density.spacing, pieces.strands, pieces.onward
     count = len(lines)
-    ends = [np.concatenate(two) for two in zip(*(_courses(lines, first, 0.0, voxel) for first in (True, False)), strict=True)]
-    valid, place, out, bend = ends
+    both = zip(*(_courses(lines, first, 0.0, voxel) for first in (True, False)), strict=True)
+    valid, *courses = (np.concatenate(ends) for ends in both)
     usable = np.flatnonzero(valid)
-    tree = cKDTree(place[usable])
-    near = _ahead(tree, usable, (place, out, bend), STATIONS[:NEAR_STATIONS], NEAREST)
+    near = _ahead(cKDTree(courses[0][usable]), usable, courses, STATIONS[:NEAR_STATIONS], NEAREST)
     row, column = np.nonzero(near < len(usable))
     one, other = usable[row], usable[near[row, column]]
     pair = np.unique(np.minimum(one, other) * (2 * count) + np.maximum(one, other))
@@ -136,8 +135,7 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     one, other = one[kept], other[kept]
     cost = np.empty(len(one))
     _weigh(
-        one, other, place, out, bend, place, out, bend, density.table, density.bricks, density.origin / voxel,
-        np.float32(strand), MEETS, cost,
+        one, other, *courses, *courses, density.table, density.bricks, density.origin / voxel, np.float32(strand), MEETS, cost
     )  # fmt: skip
     kept = cost < MEETS
     one, other = one[kept], other[kept]
@@ -206,9 +204,15 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
             tangent[n, axis] /= max(norm, 1e-9)
 
 
-def _ahead(tree: cKDTree, tips: np.ndarray, course: Sequence[np.ndarray], stations, nearest: int) -> np.ndarray:
+def _ahead(
+    tree: cKDTree,
+    tips: np.ndarray,
+    courses: Sequence[np.ndarray],
+    stations: Sequence[tuple[float, float]],
+    nearest: int,
+) -> np.ndarray:
     """(T, K) int64: what of the tree lies around the stations ahead of each of the tips; its size where that is not so much."""
-    near, (place, out, bend) = [], course
+    near, (place, out, bend) = [], courses
     for ahead, radius in stations:
         for bent in (0.5,) if ahead < STRAIGHT else (0.5, 0.0):
             centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]

@@ -21,8 +21,8 @@ from .joints import LOOSE_END, Joints, weighed_joints
 from .pieces import STEP, Pieces
 
 LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
-"""Those tried in turn where it is known; the first alone where there may be more strands. Lower ones break good joints, higher
-ones make none but bad ones."""
+"""Costs of a tip that goes on nowhere, tried in turn where it is known how many strands there are; the first alone where there
+may be more. Lower ones break good joints, higher ones make none but bad ones."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
 
@@ -60,7 +60,7 @@ def link_segments(
     tally = {
         "cuts of segments: an end beside them, or a kink": len(pieces.parent) - len(np.unique(pieces.parent)),
         "cuts that were healed": int(healed.sum()),
-        "joints weighed": len(joints.cost),
+        "joints held": len(joints.cost),
         "dearest joint allowed": round(price),
         "joints made": int(((following >= 0) & ~healed).sum()),
         "joints undone: they closed a ring": broken,

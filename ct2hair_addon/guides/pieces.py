@@ -17,7 +17,7 @@ KINK = 0.06
 KINK_SPAN = 10
 """1/voxel; a trace is cut where its bend changes by more from one span (voxel) to the next: it may have left its strand."""
 STEP = 1.0
-"""voxel between the points of a joint."""
+"""voxel between the points of a piece, and of a joint."""
 
 
 @dataclass(frozen=True)

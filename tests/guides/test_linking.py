@@ -125,7 +125,7 @@ def test_of_each_tip_the_cheapest_joints_are_held(monkeypatch):
     onward[3] = 60  # no neighbour of its own place: dear, and yet kept
 
     def found():
-        return weighed_joints(strands, np.zeros(len(lines), bool), onward, density, SEEN, 30.0, lambda *a: None)
+        return weighed_joints(strands, np.zeros(len(lines), bool), onward, density, SEEN, 30.0)
 
     whole = found()
     many = np.bincount(whole.tip, minlength=len(lines))
