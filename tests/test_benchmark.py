@@ -11,7 +11,7 @@ from ct2hair_addon import cli
 from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, runner, sets
 from ct2hair_addon.benchmark.peers import fullest_cube
 from ct2hair_addon.benchmark.sets import _flags, methods
-from ct2hair_addon.benchmark.tables import PRINTED, Table, head_table, shown
+from ct2hair_addon.benchmark.tables import PRINTED, Table, cost_table, head_table, shown, table1
 from ct2hair_addon.errors import ScanError, SettingsError
 from ct2hair_addon.volume import BrickVolume
 
@@ -78,6 +78,27 @@ def test_the_fullest_cube_holds_the_most_hair():
     volume[33:63, 17:40, 20:31] = 2.0
     volume[0, 0, 0] = 2.0
     assert fullest_cube(BrickVolume.from_dense(volume, 1.0), 1.0, edge=2).tolist() == [2, 1, 0]
+
+
+def test_what_a_stage_costs_is_told_for_ten_million_voxels_where_it_was_run_at_all():
+    seconds = {"scan": 4.0, "guides": 30.0, "dense": 1.0, "refinement": 9.0}
+    stages = [{"name": n, "seconds": s, "peak_memory": 1.0, "resumed": False} for n, s in seconds.items()]
+    resumed = [stage | {"resumed": stage["name"] == "dense"} for stage in stages]
+    results = {("bob", "ours"): {"hair_voxels": 5_000_000, "stages": stages}}
+    results["bob", "paper"] = {"hair_voxels": 5_000_000, "stages": resumed}
+    results["pixie", "paper"] = {"hair_voxels": 5_000_000, "stages": stages[:2]}
+    ours, paper, guides_alone = cost_table(results).rows
+    assert ours[-3:] == ("44 (1.0)", 60.0, 20.0)
+    assert paper[-2:] == (60.0, None)
+    assert guides_alone[-2:] == (60.0, None)
+
+
+def test_table1_has_a_cell_for_every_column():
+    rest = {"precision": 0.9, "recall": 0.8, "mse": 0.01}
+    scored = {"fine": {"iou": 0.5, **rest}, "coarse": {"iou": 0.7, **rest}}
+    table = table1({("short", "ours"): {"scores": {"refined": {"voxel": scored}}}}, {"short": "pixie"})
+    assert {len(row) for row in table.rows} == {len(table.columns)}
+    assert table.rows[-1] == ("short (pixie)", "ours: refined", 0.5, 0.9, 0.8, 1.0, 0.7, 0.9, 0.8)
 
 
 def test_the_heads_table_has_a_row_for_a_scan_that_was_refused():
