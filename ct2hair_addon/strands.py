@@ -18,6 +18,8 @@ POINT_PREFIX = "point_"
 """Key prefix of per-point attributes in an npz file; per-strand attributes keep their plain name."""
 MOST_CELLS = 512
 """Cells along an axis that places are marked in at most: 134 MB."""
+THREADED = 1000
+"""Places from which on a tree is asked on threads: to start them takes as long as fewer do."""
 
 
 def normalized(vectors: np.ndarray) -> np.ndarray:
@@ -29,6 +31,15 @@ def point_tree(points: np.ndarray) -> cKDTree:
     """A tree to find the nearest of many points (M, 3) in. Strands' lie evenly: cells cut in the middle answer as soon as
     balanced ones, and are made in half the time."""
     return cKDTree(points, balanced_tree=False)
+
+
+def nearest_points(
+    tree: cKDTree, places: np.ndarray, k: int | Sequence[int] = 1, reach: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """(distance, index) of a tree's k nearest within `reach` of each place (N, 3), as `cKDTree.query` gives them, on as many
+    threads as kernels run on."""
+    threads = numba.get_num_threads() if len(places) >= THREADED else 1
+    return tree.query(places, k=k, distance_upper_bound=reach, workers=threads)
 
 
 def points_around(points: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:

@@ -1,12 +1,13 @@
 """Strands: offsets, arc length, resampling, selection, files."""
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ct2hair_addon.errors import StrandFileError
-from ct2hair_addon.strands import Strands, concatenate, point_tree, points_around
+from ct2hair_addon.strands import THREADED, Strands, concatenate, nearest_points, point_tree, points_around
 
 
 def two_strands() -> Strands:
@@ -122,3 +123,28 @@ def test_a_tree_of_the_points_around_answers_as_one_of_all(reach):
 
 def test_nothing_is_around_no_places():
     assert not len(points_around(np.zeros((5, 3), np.float32), np.zeros((0, 3)), 1.0))
+
+
+def test_a_tree_is_asked_on_no_more_threads_than_kernels_run_on():
+    asked = []
+
+    class Tree:
+        def query(self, places, **options):
+            asked.append(options["workers"])
+
+    most = numba.get_num_threads()
+    try:
+        for threads in {1, most}:
+            numba.set_num_threads(threads)
+            for count in (THREADED - 1, THREADED):
+                nearest_points(Tree(), np.zeros((count, 3)))
+            assert asked[-2:] == [1, threads]
+    finally:
+        numba.set_num_threads(most)
+
+
+def test_the_nearest_points_are_those_within_reach():
+    tree = point_tree(np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]]))
+    distance, near = nearest_points(tree, np.array([[0.2, 0, 0]]), 3, 2.0)
+    np.testing.assert_allclose(distance, [[0.2, 0.8, np.inf]])
+    assert near.tolist() == [[0, 1, 3]]

@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 
 from ..head import Head
 from ..settings import GuideSettings
-from ..strands import Strands, normalized, point_tree
+from ..strands import Strands, nearest_points, normalized, point_tree
 
 TANGENT_SPAN = 3.0
 """mm; the length at an end over which its direction is taken: a voxel or two would be noise."""
@@ -80,7 +80,7 @@ def signs(
     size = 65536
     for start in range(0, len(samples.points), size):
         part = slice(start, start + size)
-        distance, near = tree.query(samples.points[part], k=VOTERS + 1, distance_upper_bound=reach, workers=-1)
+        distance, near = nearest_points(tree, samples.points[part], VOTERS + 1, reach)
         found = np.isfinite(distance)
         near = np.where(found, near, 0)
         agreement = np.einsum("nkc,nc->nk", tangents[near], tangents[part])

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ..head import Head
 from ..progress import Progress, silent
-from ..strands import Strands, offsets_from_counts
+from ..strands import Strands, nearest_points, offsets_from_counts
 from .growing import WALK_STEP, joined, walked_back
 from .knots import chosen_knots
 
@@ -85,7 +85,7 @@ def _passed(way, counts, tree, head, farthest):
     some = np.flatnonzero((back >= LEAVING) & (back <= farthest))
     below = head.closest_scalp(way[some]).position
     candidates = np.arange(1, min(CANDIDATES, tree.n) + 1)
-    near, knot = tree.query(below, k=candidates, distance_upper_bound=FARTHEST, workers=-1)
+    near, knot = nearest_points(tree, below, candidates, FARTHEST)
     row, column = np.nonzero(np.isfinite(near))
     step, knot = some[row], knot[row, column].astype(np.int64)
     cost = (near[row, column] / BESIDE) ** 2 + A_MILLIMETRE * back[step]

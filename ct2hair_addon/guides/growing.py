@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
-from ..strands import Strands, normalized, offsets_from_counts, point_tree, points_around
+from ..strands import Strands, nearest_points, normalized, offsets_from_counts, point_tree, points_around
 from .direction import TOUCH, end_tangents
 
 REACHES = (1.0, 2.0, 4.0)
@@ -29,8 +29,6 @@ WALK_POINTS, WALK_TURN = 16, 0.3
 """Neighbours that are listened to, and the weight of what they say against the way so far."""
 WALK_AHEAD = WALK_STEP * ((1.0 - WALK_TURN) / WALK_TURN + 0.5)
 """mm ahead that they are asked at: by so much the way lags behind, and over a curved scalp a lag would lead off it."""
-THREADED = 1000
-"""Walkers from which on a step asks on all cores: to start a query's threads takes as long as fewer do."""
 LONGEST_WALK = 150.0
 """mm that a strand is followed back at most."""
 
@@ -94,7 +92,7 @@ def _guides_for(ends, tangents, forest, reach):
     source, place = np.zeros(len(ends), np.int64), np.zeros(len(ends), np.int64)
     best = np.full(len(ends), np.inf)
     for number, (tree, _, directions) in enumerate(forest):
-        distance, near = tree.query(ends, k=CANDIDATES, distance_upper_bound=reach, workers=-1)
+        distance, near = nearest_points(tree, ends, CANDIDATES, reach)
         found = np.isfinite(distance)
         near = np.where(found, near, 0)
         agreement = np.einsum("nkc,nc->nk", directions[near], tangents)
@@ -117,7 +115,7 @@ def course_around(strands: Strands, places: np.ndarray, own: np.ndarray) -> np.n
     if not len(some):
         return normalized(own)
     points, tangents = hair.points[some], hair.tangents()[some].astype(np.float64)
-    distance, near = point_tree(points).query(places, k=COURSE_POINTS, distance_upper_bound=COURSE_REACH, workers=-1)
+    distance, near = nearest_points(point_tree(points), places, COURSE_POINTS, COURSE_REACH)
     found = np.isfinite(distance)
     tangents = tangents[np.where(found, near, 0)]
     along = found & (np.einsum("nkc,nc->nk", tangents, own) > 0.0)
@@ -180,8 +178,7 @@ def walked_back(
         if not len(going):
             break
         place, onward = path[step - 1, going].astype(np.float64), way[going]
-        asked, workers = place - WALK_AHEAD * onward, 1 if len(going) < THREADED else -1
-        distance, near = tree.query(asked, k=WALK_POINTS, distance_upper_bound=WALK_REACH, workers=workers)
+        distance, near = nearest_points(tree, place - WALK_AHEAD * onward, WALK_POINTS, WALK_REACH)
         found = np.isfinite(distance)
         near, distance = np.where(found, near, 0), np.where(found, distance, WALK_REACH)
         found &= index[near] != walkers[going][:, None]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..progress import Progress, silent
-from ..strands import Strands
+from ..strands import Strands, nearest_points
 from ..volume.grid import BrickVolume
 from .pieces import STEP, Pieces
 from .sampling import density_at
@@ -216,7 +216,7 @@ def _ahead(
     for ahead, radius in stations:
         for bent in (0.5,) if ahead < STRAIGHT else (0.5, 0.0):
             centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
-            near.append(tree.query(centre, k=nearest, distance_upper_bound=radius, workers=-1)[1])
+            near.append(nearest_points(tree, centre, nearest, radius)[1])
     return np.concatenate(near, axis=1)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..head import Head, ScalpPoints
-from ..strands import normalized
+from ..strands import nearest_points, normalized
 from .assignment import assign
 
 HEIGHT = 1.0
@@ -45,7 +45,7 @@ def strands_by_knots(knots: np.ndarray | None, head: Head, spacing: float) -> tu
     knots = by_the_scalp(np.zeros((0, 3)) if knots is None else knots, head)
     if len(knots) < FEWEST:
         return 0, True
-    apart = cKDTree(knots).query(knots, k=2, workers=-1)[0][:, 1]
+    apart = nearest_points(cKDTree(knots), knots, 2)[0][:, 1]
     return len(knots), bool(np.quantile(apart, CLOSE_SHARE) < CLOSE * spacing)
 
 
@@ -80,7 +80,7 @@ def tie_to_knots(
 
 def _chosen(roots, along, across, spread, knots, tree) -> np.ndarray:
     """(N,) the knot of each root, -1 for none. spread: (N, 2) mm along and across."""
-    near = tree.query(roots, k=min(NEAREST, len(knots)), workers=-1)[1].reshape(len(roots), -1)
+    near = nearest_points(tree, roots, min(NEAREST, len(knots)))[1].reshape(len(roots), -1)
     miss = knots[near] - roots[:, None]
     cost = (np.einsum("nkc,nc->nk", miss, along) / spread[:, :1]) ** 2
     cost += (np.einsum("nkc,nc->nk", miss, across) / spread[:, 1:]) ** 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from ..strands import Strands, point_tree, points_around
+from ..strands import Strands, nearest_points, point_tree, points_around
 
 CONTACT = 2.0
 """voxel; where a trace ends this close to another's side, the other is cut: it may have come over to the wrong strand there."""
@@ -59,7 +59,7 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
     ends = np.concatenate([lines.offsets[:-1], lines.offsets[1:] - 1])
     some = points_around(lines.points, lines.points[ends], CONTACT * voxel)
     tree = point_tree(lines.points[some])
-    near = tree.query(lines.points[ends], k=24, distance_upper_bound=CONTACT * voxel, workers=-1)[1]
+    near = nearest_points(tree, lines.points[ends], 24, CONTACT * voxel)[1]
     row, column = np.nonzero(near < len(some))
     place, end = some[near[row, column]], ends[row]
     beside = (index[place] != index[end]) & (np.abs(np.einsum("nc,nc->n", tangents[place], tangents[end])) > 0.7)

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
+from ..strands import nearest_points
 from ..volume import BrickVolume
 from .boundary import Boundary
 from .device import takes_card
@@ -122,7 +123,7 @@ def _fit_batch(start, offsets, density, bins, boundary, settings, seed, device, 
             ours = flat[torch.from_numpy(reached).to(device)]
             loss = loss + (ours - goal[pick]).square().sum()
             tree = cKDTree(flat.detach().cpu().numpy())
-            near = torch.from_numpy(tree.query(goal.cpu().numpy(), workers=numba.get_num_threads())[1]).to(device)
+            near = torch.from_numpy(nearest_points(tree, goal.cpu().numpy())[1]).to(device)
             loss = loss + (flat.index_select(0, near) - goal).square().sum() * (len(reached) / len(targets))
         now = _directions(curve)
         size = now.norm(dim=2)

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from ..progress import Progress, part, silent
-from ..strands import Strands, offsets_from_counts, point_tree
+from ..strands import Strands, nearest_points, offsets_from_counts, point_tree
 from .curves import control_points, even_lines
 from .motion import BAND, solve_bands, third
 
@@ -89,7 +89,7 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
     for start in range(0, max(len(places), 1), CHUNK):
         progress(start, len(places))
         some = places[start : start + CHUNK]
-        distance, near = tree.query(lines[some], k=NEAREST, distance_upper_bound=REACH, workers=-1)
+        distance, near = nearest_points(tree, lines[some], NEAREST, REACH)
         row, column = np.nonzero(np.isfinite(distance))
         one, other = some[row], known[near[row, column]]
         # of two that are asked alike, one side will do
