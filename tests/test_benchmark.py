@@ -178,6 +178,9 @@ def test_a_tiny_set_ends_with_its_tables_and_goes_on_from_what_it_has(tmp_path, 
     for result in values["results"]:
         assert 0.0 < result["scores"]["refined"]["voxel"]["coarse"]["iou"] <= 1.0
         assert [stage["name"] for stage in result["stages"]][-1] == "result"
+        assert result["picture"]["shows"][0] == "truth" and result["picture"]["shows"][-1] == "refined"
+        assert f"]({result['picture']['file']})" in first.out
+        assert (tmp_path / result["picture"]["file"]).stat().st_size > 10_000
     assert not (tmp_path / "runs").exists()
     # one result is lost, as if the run had been cut off: only that one is made again, and comes out the same
     (lost,) = (tmp_path / "results").glob("*.ours.*.json")

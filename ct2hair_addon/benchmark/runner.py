@@ -9,6 +9,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -28,6 +29,7 @@ from ..evaluation import (
     orientation_error,
     registration_error,
     rooted_length,
+    strip_picture,
     synthesize,
 )
 from ..head import Head, HeadMesh, axis_rotation, load_obj, remove_hairnet, template_head
@@ -167,6 +169,10 @@ class Bench:
             "tallies": {stage["name"]: stage["tally"] for stage in report["stages"]},
             "load": self.load,
         }
+        if made:
+            file = f"pictures/{case.name}.{_plain_name(label)}.jpg"
+            shows = _draw(self.folder / file, {"truth": scan.truth, **stages}, np.array(report["head"]["head_to_scan"]), found)
+            result["picture"] = {"file": file, "shows": shows}
         if "guides" in stages:
             result["scores"]["guides"]["coverage"] = coverage(stages["guides"], density, level, COVERED * case.spacing)
             result["orientation"] = orientation_scores(density, level, settings, scan.truth, stages["guides"])
@@ -238,6 +244,26 @@ def _load() -> float | None:
         return round(os.getloadavg()[0], 1)
     except (AttributeError, OSError):  # Windows
         return None
+
+
+def _draw(path: Path, sets: dict[str, Strands], head_to_scan: np.ndarray, head: HeadMesh) -> list[str]:
+    """Write a picture of sets of strands side by side; returns which it shows. One that is the same as the one before is left
+    out: where there is nothing to fill, dense strands are the guides."""
+    from PIL import Image  # late: only pictures need it
+
+    names, last = [], None
+    for name, strands in sets.items():
+        if last is None or not np.array_equal(strands.points, last.points):
+            names.append(name)
+        last = strands
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(strip_picture([sets[name] for name in names], head_to_scan, head)).save(path, quality=88)
+    return names
+
+
+def _plain_name(label: str) -> str:
+    """A label as part of a file's name that needs no quotes."""
+    return re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-")
 
 
 def _digest(values: dict[str, Any]) -> str:

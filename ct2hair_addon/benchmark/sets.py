@@ -432,6 +432,7 @@ def _write(name: str, out: Path, options: Options, page: Page, seconds: float, b
         path = out / f"{name}-{picture}.svg"
         path.write_text(svg, encoding="utf-8")
         text += f"\n![{picture}]({path.name})\n"
+    text += "".join(_shown(number) for number in page.numbers if (out / number.get("picture", {}).get("file", "?")).is_file())
     values = {
         "benchmark": name, "command": shlex.split(command), "machine": facts, "version": __version__, "sources": sources(),
         "seconds": seconds, "notes": page.notes, "results": page.numbers,
@@ -440,6 +441,13 @@ def _write(name: str, out: Path, options: Options, page: Page, seconds: float, b
     target = out / f"{name}.md"
     target.write_text(text, encoding="utf-8")
     return target
+
+
+def _shown(result: dict[str, Any]) -> str:
+    """The picture of a result and what it shows."""
+    picture = result["picture"]
+    title = f"{result['case']['style']}, {result['label']}: {', '.join(picture['shows'])}"
+    return f"\n{title}, from left to right; below a part of each, larger\n\n![{title}]({picture['file']})\n"
 
 
 def _flags(options: Options) -> str:

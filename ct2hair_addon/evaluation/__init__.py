@@ -2,6 +2,7 @@
 
 from .density import BLUR, render_density, strand_peak
 from .hairstyles import STYLES, hairstyle
+from .pictures import strip_picture
 from .report import curvature, write_report
 from .scores import (
     centre_line_error,
@@ -37,6 +38,7 @@ __all__ = [
     "rooted_length",
     "scan_scores",
     "strand_peak",
+    "strip_picture",
     "synthesize",
     "write_report",
 ]

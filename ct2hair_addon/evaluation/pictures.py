@@ -5,7 +5,8 @@ All views are in the head frame (x to the wearer's left, y to the back, z up). H
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -16,6 +17,8 @@ from ..volume.grid import trilinear
 
 PIXELS = 460
 """Width and height of a view."""
+ENLARGED = 5.0
+"""A part is shown so many times as large as the whole."""
 BACKGROUND = np.array([0.086, 0.09, 0.102], np.float32)
 SCAN_COLOUR = np.array([0.80, 0.78, 0.74], np.float32)
 HAIR_COLOUR = np.array([0.62, 0.40, 0.22], np.float32)
@@ -122,6 +125,20 @@ def slice_picture(
         colour = STRAND_COLOURS[(backed[fine.strand_index[near]] < 0.5).astype(np.int64)]
         picture[row[inside], column[inside]] = colour[inside]
     return picture
+
+
+def strip_picture(sets: Sequence[Strands], head_to_scan: np.ndarray, head=None, pixels: int = PIXELS) -> np.ndarray:
+    """(2 P, P N, 3) uint8: N sets of strands beside each other, seen from the left, and under each a part of it, larger.
+
+    The views hold the first set, the truth or what others are compared with; the part is where half of its points lie to
+    each side. head: `HeadMesh`, scan frame.
+    """
+    points = sets[0].points if len(sets[0]) else head.vertices
+    whole = cameras(head_to_scan, points.min(axis=0), points.max(axis=0), pixels)["left"]
+    near = replace(whole, centre=np.median(points, axis=0), half=whole.half / ENLARGED)
+    return np.concatenate(
+        [np.concatenate([strand_picture(strands, camera, head) for strands in sets], axis=1) for camera in (whole, near)]
+    )
 
 
 def _to_world(camera: Camera) -> np.ndarray:
