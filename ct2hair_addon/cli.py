@@ -412,7 +412,7 @@ def _add_benchmark(commands) -> None:
     parser.add_argument("--spacing", type=float, default=0.0, metavar="MM", help="voxel size; 0 takes the set's [mm]")
     parser.add_argument("--snr", type=float, default=0.0, metavar="S", help="a strand's peak over the noise; 0 takes the set's")
     parser.add_argument("--styles", nargs="+", default=[], metavar="STYLE", help="hairstyles instead of the set's")
-    parser.add_argument("--largest", type=float, default=3e6, metavar="VOXELS", help="scale: active voxels at most")
+    parser.add_argument("--largest", type=float, default=6e6, metavar="VOXELS", help="scale: active voxels at most")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="processor threads; 0 takes all")
     parser.add_argument("--keep", action="store_true", help="keep the folders of the reconstructions")
     parser.add_argument("--fresh", action="store_true", help="forget results of earlier calls")

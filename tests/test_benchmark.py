@@ -7,7 +7,7 @@ import xml.etree.ElementTree as xml
 import numpy as np
 import pytest
 
-from ct2hair_addon import cli
+from ct2hair_addon import benchmark, cli
 from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, runner, sets
 from ct2hair_addon.benchmark.peers import fullest_cube
 from ct2hair_addon.benchmark.sets import _flags, methods
@@ -128,6 +128,17 @@ def test_table1_takes_hairstyles_that_the_paper_has_no_row_for(tmp_path, monkeyp
     asked.clear()
     run_benchmark("styles", tmp_path, Options(styles=("bob",)))
     assert asked == [("bob", "ours", None), ("bob", "paper", "guides")]
+
+
+def test_the_commands_defaults_are_the_sets_own(tmp_path, monkeypatch):
+    taken = []
+    page = tmp_path / "page.md"
+    page.write_text("")
+    monkeypatch.setattr(benchmark, "run_benchmark", lambda name, out, options, say: taken.append(options) or page)
+    assert cli.main(["benchmark", "scale"]) == cli.DONE
+    assert {known.name: getattr(taken[0], known.name) or 0 for known in dataclasses.fields(Options)} == {
+        known.name: getattr(Options(), known.name) or 0 for known in dataclasses.fields(Options)
+    } | {"seeds": [101]}
 
 
 def test_the_page_says_how_to_get_it_again():

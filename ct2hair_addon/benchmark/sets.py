@@ -42,8 +42,9 @@ SMALLEST = (800, 1.2)
 FILL = 1280.0
 SIZES = (300, 600, 1200, 2400, 4800, 8000, 16000, 32000, 60000)
 """Strands of the scans of `scale`, at FILL; as many are run as stay under the largest number of voxels."""
-VOXELS_A_STRAND = 0.9e3
-"""Active voxels a strand at 8,000 strands and 0.4 mm, to guess a scan's size before it is made; it grows with their root."""
+VOXELS_A_STRAND = 3.8e3
+"""Active voxels a strand of wavy hair, at 8,000 of them and 0.4 mm, to guess a scan's size before it is made; it grows with
+their root. Shorter hair has fewer."""
 SNR, SNRS = 4.0, (2.0, 10.0)
 """The scans' signal-to-noise ratio, and those of `heads`."""
 PAPER_STRANDS = 100_000
@@ -62,7 +63,7 @@ class Options:
     spacing: float = 0.0
     snr: float = 0.0
     styles: Sequence[str] = ()
-    largest: float = 3e6
+    largest: float = 6e6
     threads: int = 0
     keep: bool = False
     fresh: bool = False
