@@ -433,7 +433,9 @@ def _write(name: str, out: Path, options: Options, page: Page, seconds: float, b
         path = out / f"{name}-{picture}.svg"
         path.write_text(svg, encoding="utf-8")
         text += f"\n![{picture}]({path.name})\n"
-    text += "".join(_shown(number) for number in page.numbers if (out / number.get("picture", {}).get("file", "?")).is_file())
+    for result in page.numbers:
+        if "picture" in result and (out / result["picture"]["file"]).is_file():
+            text += _captioned(result)
     values = {
         "benchmark": name, "command": shlex.split(command), "machine": facts, "version": __version__, "sources": sources(),
         "seconds": seconds, "notes": page.notes, "results": page.numbers,
@@ -444,8 +446,8 @@ def _write(name: str, out: Path, options: Options, page: Page, seconds: float, b
     return target
 
 
-def _shown(result: dict[str, Any]) -> str:
-    """The picture of a result and what it shows."""
+def _captioned(result: dict[str, Any]) -> str:
+    """The picture of a result under a line that says what it shows, in Markdown."""
     picture = result["picture"]
     title = f"{result['case']['style']}, {result['label']}: {', '.join(picture['shows'])}"
     return f"\n{title}, from left to right; below a part of each, larger\n\n![{title}]({picture['file']})\n"

@@ -158,16 +158,13 @@ def cost_table(results: dict[tuple[str, str], dict[str, Any]]) -> Table:
         note="A dash: taken from a run before, whose stage is the same. For 10^7: seconds for as many hair voxels.",
     )
     for (row, method), result in results.items():
-        by_name = {stage["name"]: stage for stage in result["stages"]}
-        cells = []
-        for name in names:
-            stage = by_name.get(name)
-            cells.append(None if stage is None or stage["resumed"] else f"{stage['seconds']:.1f} ({stage['peak_memory']:.1f})")
+        run = {stage["name"]: stage for stage in result["stages"] if not stage["resumed"]}
+        cells = [f"{run[name]['seconds']:.1f} ({run[name]['peak_memory']:.1f})" if name in run else None for name in names]
         total = sum(stage["seconds"] for stage in result["stages"])
         peak = max(stage["peak_memory"] for stage in result["stages"])
         rates = []
         for group in PER_VOXEL.values():
-            done = [by_name[name]["seconds"] for name in group if name in by_name and not by_name[name]["resumed"]]
-            rates.append(1e7 * sum(done) / max(result["hair_voxels"], 1) if len(done) == len(group) else None)
+            seconds = sum(run[name]["seconds"] for name in group) if run.keys() >= set(group) else None
+            rates.append(None if seconds is None else 1e7 * seconds / max(result["hair_voxels"], 1))
         table.rows.append((row, method, result["hair_voxels"], *cells, f"{total:.0f} ({peak:.1f})", *rates))
     return table
