@@ -48,8 +48,10 @@ BELOW_NOISE = 3.5
 and few of those go on like a line."""
 LINE_DIRECTIONS = 3
 """A line seen along 13 directions goes on in at most this many of them; a sheet in more."""
-LEAST_LENGTH, LEAST_SHARE = 5000.0, 0.08
+LEAST_LENGTH, LEAST_SHARE = 4000.0, 0.08
 """mm of lines needed, and the lines' share of all peaks that are no blobs, for a scan to show hair."""
+FEW_LENGTH, FEW_SHARE = 1000.0, 0.03
+"""The same where there is a mannequin, for a scan that may show hair: tied hair, of which little runs alone. Knots decide."""
 PEAK_EVERY = 4.5
 """voxel; a strand shows a peak about that often along its way."""
 PILE = 0.4
@@ -59,6 +61,11 @@ PILE_BIN, PILE_TAPS = 0.04, np.array([0.06, 0.24, 0.4, 0.24, 0.06])
 STANDS_OUT, LEAST_PILE = (0.75, 4.0), (100, 0.02)
 """A lower pile counts, too, where heights fall to this share of it before they rise again, by so many standard deviations, and
 so many lines, and this share of all, are in it: the few strands that run alone beside a braid."""
+FAINTEST, ONSET = (8, 0.01), 0.95
+"""Nothing is fainter than a lone strand: so many lines, and this share of all, lie below the onset of their heights, which is
+this share of a lone strand's: 0.82 in much noise to 1.2 where few strands run alone."""
+BUNDLED = 1.9
+"""A pile over so many times the onset is of bundles: a lone strand's lies at 1.0 to 1.5 of it, tied hair's at 2.1 to 14."""
 HAIR_SHARE = 0.4
 """A voxel is hair above this share of a lone strand's peak."""
 KNOT_SHARE = 2.2
@@ -75,7 +82,8 @@ class Thresholds:
 
     air: value of air; noise: its standard deviation. strand: peak of a lone strand above air. hair: a voxel above it is
     hair; knots: a blob above it is a knot; solid: a large body above it is the mannequin, None where there is none.
-    lines: strand-like peaks that hair was found by. chosen: names of those that the settings gave.
+    lines: strand-like peaks that hair was found by. chosen: names of those that the settings gave. doubt: why this may be no
+    hair, for the error, unless a mannequin turns out to wear knots; empty where hair is sure.
     """
 
     air: float
@@ -86,6 +94,7 @@ class Thresholds:
     solid: float | None
     lines: int
     chosen: tuple[str, ...] = ()
+    doubt: str = ""
 
 
 def find_thresholds(reader: ScanReader, settings: ScanSettings, progress: Progress = silent) -> Thresholds:
@@ -112,8 +121,6 @@ def find_thresholds(reader: ScanReader, settings: ScanSettings, progress: Progre
         if settings.hair <= air:
             raise ScanError(f"{reader.path}: scan.hair is {settings.hair:g}, not above air ({air:.6g}); set it higher")
         strand = strand if shown else (settings.hair - air) / HAIR_SHARE
-    elif not shown:
-        raise ScanError(_no_hair(reader, air, noise, length, share))
     hair = settings.hair if "hair" in chosen else air + HAIR_SHARE * strand
     knots = settings.knots if "knots" in chosen else air + KNOT_SHARE * strand
     volume = float(np.prod(np.array(reader.shape) * reader.spacing))
@@ -122,8 +129,13 @@ def find_thresholds(reader: ScanReader, settings: ScanSettings, progress: Progre
         if "solid" in chosen
         else _solid_level(means, air, strand, volume, flat_limit(float(np.mean(reader.spacing))))
     )
+    doubt = ""
+    if not shown and "hair" not in chosen:
+        doubt = _no_hair(reader, air, noise, length, share)
+        if solid is None or length < FEW_LENGTH or share < FEW_SHARE:
+            raise ScanError(doubt)
     progress(1.0, 1.0)
-    return Thresholds(float(air), float(noise), float(strand), float(hair), float(knots), solid, int(lines), chosen)
+    return Thresholds(float(air), float(noise), float(strand), float(hair), float(knots), solid, int(lines), chosen, doubt)
 
 
 def _no_hair(reader, air, noise, length, share) -> str:
@@ -198,7 +210,8 @@ def _flank(values: np.ndarray, air: float, noise: float) -> tuple[float, float]:
 def strand_level(peaks: np.ndarray, goes_on: np.ndarray) -> tuple[float, int, float]:
     """(peak of a lone strand above air, lines, their share of lines and sheets) from `find_peaks`' values and directions.
 
-    Heights pile up at one strand, two that touch, and so on: the lowest pile is a lone strand's.
+    Heights pile up at one strand, two that touch, and so on: the lowest pile is a lone strand's. Where tied hair hides it in
+    noise, so that the lowest pile is of bundles, the faintest lines tell.
     """
     on = goes_on[:, 0]
     line = (on >= 1) & (on <= LINE_DIRECTIONS)
@@ -209,7 +222,12 @@ def strand_level(peaks: np.ndarray, goes_on: np.ndarray) -> tuple[float, int, fl
     low, high = np.quantile(height, [0.0, 0.9])
     counts, edges = np.histogram(height, np.arange(low - 0.3, high + 0.34, PILE_BIN))
     pile = _lowest_pile(counts.astype(np.float64))
-    return float(np.exp(0.5 * (edges[pile] + edges[pile + 1]))) / LINE_SHARE, lines, lines / (lines + sheets)
+    level = float(np.exp(0.5 * (edges[pile] + edges[pile + 1])))
+    nth = max(FAINTEST[0], int(FAINTEST[1] * lines))
+    onset = float(np.exp(np.partition(height, nth)[nth])) if nth < lines else level
+    if level > BUNDLED * onset:
+        level = onset / ONSET
+    return level / LINE_SHARE, lines, lines / (lines + sheets)
 
 
 def _lowest_pile(counts: np.ndarray) -> int:

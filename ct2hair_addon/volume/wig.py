@@ -6,6 +6,7 @@ strand-like in them are kept.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from .structure import (
     MEAN_REACH,
     NOISE_SHARE,
     PERSISTS,
+    SMOOTHING,
     TAPS,
     bump,
     cut_block,
@@ -48,6 +50,9 @@ MARGIN = 2
 """Voxels around a brick that are looked at, too, so that a strand's flank beyond its brick is kept."""
 CONTRAST = 0.4
 """A voxel is strand-like where the smoothed density exceeds the local mean by this share of a lone strand's smoothed peak."""
+FALSE_BRICKS = 0.01
+"""Share of the bricks of pure noise that may be kept. Where more would be by LEAST_VOXELS alone (signal to noise below 3),
+voxels count only in clusters so large that noise makes fewer."""
 CORE_MEAN = 0.4
 """Inside a body the local mean, too, is above this share of its threshold; over a thin bundle of hair it is not."""
 FLAT_EVERY = 2
@@ -92,7 +97,8 @@ class WigScan:
 def import_scan(
     reader: ScanReader, thresholds: Thresholds, settings: ScanSettings | None = None, progress: Progress = silent
 ) -> WigScan:
-    """The wig in a scan. Voxels that are no cubes are resampled to cubes. Raises ScanError where no hair is left."""
+    """The wig in a scan. Voxels that are no cubes are resampled to cubes. Raises ScanError where no hair is left, or where
+    the thresholds were in doubt and no mannequin wears knots."""
     scan = cubic(reader)
     levels = _Levels.of(thresholds, float(scan.spacing[0]))
     size = [scan.shape[axis] for axis in scan.order]
@@ -138,11 +144,15 @@ def import_scan(
         # what is stored for its dense voxels alone stays where that was hair after all
         keep |= (core_table[tuple(index.T)] >= 0) & ~bodies.lie_in(index)
         bumps = [found[bodies.near(np.rint(found).astype(np.int64))] for found in bumps]
-        if sum(len(found) for found in bumps) >= ENOUGH_BUMPS:
+        worn = sum(len(found) for found in bumps) >= ENOUGH_BUMPS
+        if worn:
             # knots on the mannequin's skin are sure; blobs elsewhere are hair that crosses
             knots = [np.zeros((0, 3), np.float32)]
     else:
         keep[:] = True
+        worn = False
+    if thresholds.doubt and not worn:
+        raise ScanError(thresholds.doubt)
     knots += bumps
     table, bricks = _kept(table, bricks, keep)
     density = _in_scan_axes(table, bricks, scan)
@@ -180,11 +190,13 @@ def import_scan(
 class _Levels:
     """Densities above air: strand-like contrast, knots (smoothed), the mannequin's core; float32. solid is huge for none.
 
-    flat: the ripple that the mannequin stays below; infinite where the settings give the mannequin's level, which then decides.
+    cluster: strand-like voxels that must hang together; 1 for any. flat: the ripple that the mannequin stays below; infinite
+    where the settings give the mannequin's level, which then decides.
     """
 
     air: np.float32
     contrast: np.float32
+    cluster: int
     knots: np.float32
     solid: np.float32
     flat: np.float32
@@ -196,10 +208,29 @@ class _Levels:
         )  # fmt: skip
         if "hair" in thresholds.chosen:
             contrast = LINE_SHARE * (thresholds.hair - thresholds.air)
+        cluster = noise_cluster(float(contrast) / max(NOISE_SHARE * thresholds.noise, 1e-30))
         knots = LINE_SHARE * (thresholds.knots - thresholds.air)
         solid = thresholds.solid - thresholds.air if thresholds.solid is not None else 3e38
         flat = np.inf if "solid" in thresholds.chosen else flat_limit(spacing)
-        return cls(*(np.float32(value) for value in (thresholds.air, contrast, knots, solid, flat)))
+        air, contrast, knots, solid, flat = (np.float32(v) for v in (thresholds.air, contrast, knots, solid, flat))
+        return cls(air, contrast, cluster, knots, solid, flat)
+
+
+def noise_cluster(level: float) -> int:
+    """How many voxels above `level`, in standard deviations of the smoothed noise, must hang together to be no noise: 1 where
+    LEAST_VOXELS is enough to keep but FALSE_BRICKS of the bricks of noise out.
+
+    Clusters over a high level of a smooth Gaussian field come at random, and k voxels of one in a power 2/3 exponentially
+    (Friston et al. 1994, Assessing the significance of focal activations using their spatial extent, eqs. 2, 3, 11).
+    """
+    rough = 2.0 * SMOOTHING**2  # the field's roughness is 1 / rough on each axis
+    above = 0.5 * math.erfc(level / math.sqrt(2.0))
+    clusters = (level**2 - 1.0) * math.exp(-0.5 * level**2) / ((2.0 * math.pi) ** 2 * rough**1.5)
+    if level <= 1.5 or not clusters * (BRICK + 2 * MARGIN) ** 3 > FALSE_BRICKS:
+        return 1
+    shape = (math.gamma(2.5) * clusters / above) ** (2.0 / 3.0)
+    least = (math.log(clusters * (BRICK + 2 * MARGIN) ** 3 / FALSE_BRICKS) / shape) ** 1.5
+    return math.ceil(least) if least > LEAST_VOXELS else 1
 
 
 @dataclass(frozen=True)
@@ -262,8 +293,8 @@ def _look(slab: np.ndarray, before: int, own: int, low: int, levels: _Levels) ->
     knots = np.empty((len(corners), MOST_KNOTS, 3), np.float32)
     counts = np.zeros((len(corners), 3), np.int64)
     _mark(
-        slab, before, own, corners, levels.air, levels.contrast, levels.knots, levels.solid, levels.flat, TAPS, DIRECTIONS,
-        flags, cores, flats, knots, counts,
+        slab, before, own, corners, levels.air, levels.contrast, levels.cluster, levels.knots, levels.solid, levels.flat, TAPS,
+        DIRECTIONS, flags, cores, flats, knots, counts,
     )  # fmt: skip
     on_skin = np.concatenate([knots[n, :count] for n, count in enumerate(counts[:, 2])]) + [low, 0, 0]
     in_hair = np.concatenate([knots[n, first:end] for n, (end, _, first) in enumerate(counts)]) + [low, 0, 0]
@@ -272,7 +303,8 @@ def _look(slab: np.ndarray, before: int, own: int, low: int, levels: _Levels) ->
 
 @numba.njit(cache=True, parallel=True, nogil=True)
 def _mark(
-    slab, before, own, corners, air, contrast, knots, solid, flat, taps, directions, flags, cores, flats, places, counts
+    slab, before, own, corners, air, contrast, cluster, knots, solid, flat, taps, directions,
+    flags, cores, flats, places, counts,
 ):  # fmt: skip
     reach = MARGIN + CLEAR
     for n in numba.prange(len(corners)):
@@ -312,11 +344,21 @@ def _mark(
             counts[n, 0] = counts[n, 2] = _bumps(
                 smooth, mean, near, reach, edge, solid, BUMP * knots / BLOB_VARIANCE, low, own, places[n]
             )
+        lone = np.zeros((wide, wide, wide) if cluster > 1 else (0, 0, 0), np.bool_)
+        if cluster > 1:
+            for i in range(wide):
+                for j in range(wide):
+                    for k in range(wide):
+                        over = smooth[i + edge, j + edge, k + edge] - mean[i, j, k] > contrast
+                        lone[i, j, k] = over and not near[i, j, k]
+            _leave_small(lone, cluster)
         found = np.zeros((BLOCK // BRICK, BLOCK // BRICK, BLOCK // BRICK), np.int64)
         for i in range(CLEAR, wide - CLEAR):
             for j in range(CLEAR, wide - CLEAR):
                 for k in range(CLEAR, wide - CLEAR):
                     if smooth[i + edge, j + edge, k + edge] - mean[i, j, k] <= contrast or near[i, j, k]:
+                        continue
+                    if cluster > 1 and lone[i, j, k]:
                         continue
                     a, b, c = i - reach, j - reach, k - reach
                     if 0 <= a < BLOCK and 0 <= b < BLOCK and 0 <= c < BLOCK:
@@ -347,6 +389,38 @@ def _mark(
             x, y, z = low[0] + x - margin, low[1] + y - margin, low[2] + z - margin
             places[n, at, 0], places[n, at, 1], places[n, at, 2] = x, y, z
             counts[n, 0] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _leave_small(where, least):
+    """Leave True only in clusters of `where`, over the faces of voxels, of fewer than `least`."""
+    n = len(where)
+    stack = np.empty((n**3, 3), np.int16)
+    seen = np.zeros((n, n, n), np.bool_)
+    for a in range(n):
+        for b in range(n):
+            for c in range(n):
+                if not where[a, b, c] or seen[a, b, c]:
+                    continue
+                seen[a, b, c] = True
+                stack[0, 0], stack[0, 1], stack[0, 2] = a, b, c
+                count, at = 1, 0
+                while at < count:
+                    i, j, k = stack[at, 0], stack[at, 1], stack[at, 2]
+                    at += 1
+                    for axis in range(3):
+                        for step in range(-1, 2, 2):
+                            x = i + (step if axis == 0 else 0)
+                            y = j + (step if axis == 1 else 0)
+                            z = k + (step if axis == 2 else 0)
+                            if x < 0 or y < 0 or z < 0 or x >= n or y >= n or z >= n or seen[x, y, z] or not where[x, y, z]:
+                                continue
+                            seen[x, y, z] = True
+                            stack[count, 0], stack[count, 1], stack[count, 2] = x, y, z
+                            count += 1
+                if count >= least:
+                    for at in range(count):
+                        where[stack[at, 0], stack[at, 1], stack[at, 2]] = False
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 
 from ct2hair_addon.errors import ScanError
@@ -13,6 +14,8 @@ from ct2hair_addon.evaluation import render_density, strand_peak, synthesize
 from ct2hair_addon.settings import ScanSettings
 from ct2hair_addon.strands import Strands, concatenate
 from ct2hair_addon.volume import Thresholds, find_thresholds, import_scan, open_scan, wig, write_scan
+from ct2hair_addon.volume.grid import BRICK
+from ct2hair_addon.volume.structure import SMOOTHING
 
 SPACING = 0.7
 RADIUS = 40.0
@@ -94,6 +97,54 @@ def test_the_hair_is_kept_and_most_of_the_air_is_not(result, scan, dense):
     bricks = tally["bricks kept"] + tally["bricks left out: air"] + tally["bricks left out: mannequin"]
     assert bricks == result.density.table.size and tally["bricks kept"] == len(result.density.bricks)
     assert tally["voxels of the scan"] == values.size
+
+
+def test_at_half_the_signal_noise_is_left_out_and_hair_is_kept(spikes, ball, tmp_path):
+    made = synthesize(spikes, ball, tmp_path / "scan.nrrd", SPACING, seed=4, snr=2.0)
+    with open_scan(made.files["scan"]) as reader:
+        values, origin = reader.slab(0, reader.shape[2]), reader.origin
+        found = import_scan(reader, find_thresholds(reader, ScanSettings())).density.block((0, 0, 0), values.shape)
+    clean = render_density(made.truth, SPACING, 0.85, origin, values.shape).block((0, 0, 0), values.shape)
+    hair = (clean > 0.35 * strand_peak(0.85)) & (distance_to_ball(values.shape, origin) > 4.0)
+    assert np.mean(found[hair] != 0.0) > 0.975
+    assert np.mean(found[clean == 0.0] == 0.0) > 0.6
+
+
+@pytest.mark.parametrize("level", [2.4, 2.8, 3.3])
+def test_noise_makes_a_cluster_that_large_in_less_than_a_brick_of_a_hundred(level):
+    noise = gaussian_filter(np.random.default_rng(6).normal(size=(180, 180, 180)).astype(np.float32), SMOOTHING, truncate=3.0)
+    clusters, _ = label(noise > level * noise.std())
+    size = np.bincount(clusters.ravel())[1:]
+    bricks = noise.size / (BRICK + 2 * wig.MARGIN) ** 3
+    least = wig.noise_cluster(level)
+    assert np.count_nonzero(size >= least) < wig.FALSE_BRICKS * bricks
+    # and much smaller ones are no rarity
+    assert np.count_nonzero(size >= 0.6 * least) > wig.FALSE_BRICKS * bricks
+
+
+def test_a_clear_signal_needs_no_clusters():
+    assert wig.noise_cluster(4.3) == wig.noise_cluster(1e30) == 1
+
+
+def test_only_small_clusters_are_left():
+    where = np.zeros((12, 12, 12), np.bool_)
+    where[1, 1, 1:5] = where[1, 2, 4] = True
+    where[3, 2, 4] = where[8, 8, 2:6] = where[11, 11, 11] = True
+    whole = where.copy()
+    wig._leave_small(where, 5)
+    whole[1, 1, 1:5] = whole[1, 2, 4] = False
+    np.testing.assert_array_equal(where, whole)
+
+
+def test_where_thresholds_are_in_doubt_the_mannequins_knots_decide(scan, piece, tmp_path):
+    with open_scan(scan.files["scan"]) as reader:
+        thresholds = find_thresholds(reader, ScanSettings())
+        assert not thresholds.doubt
+        assert len(import_scan(reader, replace(thresholds, doubt="no hair was found")).knots) > 500
+    np.save(tmp_path / "scan.npy", piece)
+    for levels in (BY_HAND, NO_BODY):
+        with pytest.raises(ScanError, match="no hair was found: few lines"):
+            imported(tmp_path / "scan.npy", replace(levels, doubt="no hair was found: few lines"))
 
 
 def test_the_mannequin_is_cleared_from_its_wall_inwards(result, dense):
