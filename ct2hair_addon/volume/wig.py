@@ -177,6 +177,9 @@ def import_scan(
         warnings = (*scan.warnings, f"{where}: the scan is taken as having no mannequin")
     else:
         warnings = tuple(scan.warnings)
+    if thresholds.doubt:
+        worn_knots = f"the {tally['knot points']:,} knots on its mannequin"
+        warnings += (f"{scan.path}: little hair runs alone; taken for a wig by {worn_knots}",)
     axes = np.argsort(scan.order)
     points = [
         (np.asarray(found, np.float64)[:, axes] * cell + scan.origin).astype(np.float32)

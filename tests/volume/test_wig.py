@@ -140,7 +140,9 @@ def test_where_thresholds_are_in_doubt_the_mannequins_knots_decide(scan, piece, 
     with open_scan(scan.files["scan"]) as reader:
         thresholds = find_thresholds(reader, ScanSettings())
         assert not thresholds.doubt
-        assert len(import_scan(reader, replace(thresholds, doubt="no hair was found")).knots) > 500
+        taken = import_scan(reader, replace(thresholds, doubt="no hair was found"))
+    assert len(taken.knots) > 500
+    assert any(f"taken for a wig by the {len(taken.knots):,} knots on its mannequin" in text for text in taken.warnings)
     np.save(tmp_path / "scan.npy", piece)
     for levels in (BY_HAND, NO_BODY):
         with pytest.raises(ScanError, match="no hair was found: few lines"):
