@@ -51,7 +51,7 @@ MARGIN = 2
 CONTRAST = 0.4
 """A voxel is strand-like where the smoothed density exceeds the local mean by this share of a lone strand's smoothed peak."""
 FALSE_BRICKS = 0.01
-"""Share of the bricks of pure noise that may be kept. Where more would be by LEAST_VOXELS alone (signal to noise below 3),
+"""Share of the bricks of pure noise that may be kept. Where more would be by LEAST_VOXELS alone (signal to noise below 3.5),
 voxels count only in clusters so large that noise makes fewer."""
 CORE_MEAN = 0.4
 """Inside a body the local mean, too, is above this share of its threshold; over a thin bundle of hair it is not."""
@@ -356,20 +356,28 @@ def _mark(
                         lone[i, j, k] = over and not near[i, j, k]
             _leave_small(lone, cluster)
         found = np.zeros((BLOCK // BRICK, BLOCK // BRICK, BLOCK // BRICK), np.int64)
+        beside = np.zeros(found.shape, np.bool_)
+        if some and cluster > 1:
+            # beside a body the mean is high, and hair that lies on it shows little over that: there any voxel counts
+            for i in range(reach, reach + BLOCK):
+                for j in range(reach, reach + BLOCK):
+                    for k in range(reach, reach + BLOCK):
+                        if near[i, j, k]:
+                            beside[(i - reach) // BRICK, (j - reach) // BRICK, (k - reach) // BRICK] = True
         for i in range(CLEAR, wide - CLEAR):
             for j in range(CLEAR, wide - CLEAR):
                 for k in range(CLEAR, wide - CLEAR):
                     if smooth[i + edge, j + edge, k + edge] - mean[i, j, k] <= contrast or near[i, j, k]:
                         continue
-                    if cluster > 1 and lone[i, j, k]:
-                        continue
+                    small = cluster > 1 and lone[i, j, k]
                     a, b, c = i - reach, j - reach, k - reach
-                    if 0 <= a < BLOCK and 0 <= b < BLOCK and 0 <= c < BLOCK:
+                    if not small and 0 <= a < BLOCK and 0 <= b < BLOCK and 0 <= c < BLOCK:
                         counts[n, 1] += 1
                     for I in range(max(a - MARGIN, 0) // BRICK, min(a + MARGIN, BLOCK - 1) // BRICK + 1):
                         for J in range(max(b - MARGIN, 0) // BRICK, min(b + MARGIN, BLOCK - 1) // BRICK + 1):
                             for K in range(max(c - MARGIN, 0) // BRICK, min(c + MARGIN, BLOCK - 1) // BRICK + 1):
-                                found[I, J, K] += 1
+                                if not small or beside[I, J, K]:
+                                    found[I, J, K] += 1
         for a in range(found.shape[0]):
             for b in range(found.shape[1]):
                 for c in range(found.shape[2]):
