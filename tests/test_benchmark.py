@@ -130,6 +130,32 @@ def test_table1_takes_hairstyles_that_the_paper_has_no_row_for(tmp_path, monkeyp
     assert asked == [("bob", "ours", None), ("bob", "paper", "guides")]
 
 
+def test_a_size_that_is_refused_is_a_note_and_the_larger_ones_are_measured(tmp_path, monkeypatch):
+    def run(bench, case, label, settings, until):
+        if case.strands < 1000:
+            raise ScanError("too few knots")
+        done = {"name": "guides", "seconds": 5.0, "peak_memory": 1.0, "resumed": False}
+        off = {"median": 5.0, "p90": 12.0}
+        guides = {
+            "centre_line_mm": {"median": 0.1}, "coverage": 0.8, "direction": {"right": 1.0}, "rooted_length": 1.0,
+            "counts": {"result_strands": case.strands},
+        }  # fmt: skip
+        return {
+            "case": dataclasses.asdict(case) | {"fill": case.fill}, "label": label, "hair_voxels": 500 * case.strands,
+            "stages": [done], "orientation": off | {"traced": off}, "registration_mm": {"median": 0.1},
+            "scores": {"guides": guides},
+        }  # fmt: skip
+
+    monkeypatch.setattr(Bench, "run", run)
+    page = run_benchmark("scale", tmp_path, Options(largest=1e6)).read_text(encoding="utf-8")
+    assert "- pixie, ours, refused: too few knots\n" in page and "scans of 4800, 8000, 16000, 32000, 60000 strands" in page
+    rows = [line for line in page.splitlines() if "ours | " in line]
+    assert [row.split("|")[1].split()[0] for row in rows] == ["1200", "2400"] * 2
+    # of a size too small for all, too, there is a page
+    page = run_benchmark("scale", tmp_path, Options(largest=1.5e5)).read_text(encoding="utf-8")
+    assert "refused: too few knots" in page and "ours | " not in page
+
+
 def test_the_commands_defaults_are_the_sets_own(tmp_path, monkeypatch):
     taken = []
     page = tmp_path / "page.md"

@@ -223,16 +223,18 @@ def noise_cluster(level: float) -> int:
     """How many voxels above `level`, in standard deviations of the smoothed noise, must hang together to be no noise: 1 where
     LEAST_VOXELS is enough to keep but FALSE_BRICKS of the bricks of noise out.
 
-    Clusters over a high level of a smooth Gaussian field come at random, and k voxels of one in a power 2/3 exponentially
+    Clusters over a high level of a smooth Gaussian field come at random, so many a voxel, and their sizes to the power 2/3 are
+    exponential
     (Friston et al. 1994, Assessing the significance of focal activations using their spatial extent, eqs. 2, 3, 11).
     """
     rough = 2.0 * SMOOTHING**2  # the field's roughness is 1 / rough on each axis
-    above = 0.5 * math.erfc(level / math.sqrt(2.0))
-    clusters = (level**2 - 1.0) * math.exp(-0.5 * level**2) / ((2.0 * math.pi) ** 2 * rough**1.5)
-    if level <= 1.5 or not clusters * (BRICK + 2 * MARGIN) ** 3 > FALSE_BRICKS:
+    voxel = (level**2 - 1.0) * math.exp(-0.5 * level**2) / ((2.0 * math.pi) ** 2 * rough**1.5)
+    brick = voxel * (BRICK + 2 * MARGIN) ** 3
+    if level <= 1.5 or brick <= FALSE_BRICKS:
         return 1
-    shape = (math.gamma(2.5) * clusters / above) ** (2.0 / 3.0)
-    least = (math.log(clusters * (BRICK + 2 * MARGIN) ** 3 / FALSE_BRICKS) / shape) ** 1.5
+    above = 0.5 * math.erfc(level / math.sqrt(2.0))
+    shape = (math.gamma(2.5) * voxel / above) ** (2.0 / 3.0)
+    least = (math.log(brick / FALSE_BRICKS) / shape) ** 1.5
     return math.ceil(least) if least > LEAST_VOXELS else 1
 
 
