@@ -12,12 +12,12 @@ import numba
 import numpy as np
 
 from ..head import Head, HeadMesh
+from ..neighbours import PointGrid, nearest_rows
 from ..progress import Progress, part, silent
 from ..strands import Strands
 from ..volume import BRICK, BrickVolume
 from .curves import curve_arcs, sample_curves, sample_tangents
 from .density import BLUR, frame_around, render_density, render_layers, strand_peak
-from .neighbours import PointGrid, nearest_rows
 from .spectrum import curvature_spectrum
 
 VOXEL_BLUR = 0.8

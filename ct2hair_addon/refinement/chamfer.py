@@ -9,12 +9,11 @@ from __future__ import annotations
 import numba
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
+from ..neighbours import PointGrid
 from ..progress import Progress, part, silent
 from ..settings import RefinementSettings
-from ..strands import nearest_points
-from ..volume import BrickVolume
+from ..volume import BRICK, BrickVolume
 from .boundary import Boundary
 from .device import takes_card
 
@@ -120,10 +119,10 @@ def _fit_batch(start, offsets, density, bins, boundary, settings, seed, device, 
             reached = np.flatnonzero(found >= 0)
             goal = torch.tensor(targets * density.spacing + density.origin, dtype=torch.float32, device=device)
             pick = torch.from_numpy(found[reached]).to(device)
-            ours = flat[torch.from_numpy(reached).to(device)]
-            loss = loss + (ours - goal[pick]).square().sum()
-            tree = cKDTree(flat.detach().cpu().numpy())
-            near = torch.from_numpy(nearest_points(tree, goal.cpu().numpy())[1]).to(device)
+            drawn = flat[torch.from_numpy(reached).to(device)]
+            loss = loss + (drawn - goal[pick]).square().sum()
+            ours = PointGrid.build(flat.detach().cpu().numpy())
+            near = torch.from_numpy(ours.nearest(goal.cpu().numpy(), 1, np.inf)[0][:, 0]).to(device)
             loss = loss + (flat.index_select(0, near) - goal).square().sum() * (len(reached) / len(targets))
         now = _directions(curve)
         size = now.norm(dim=2)
@@ -200,11 +199,13 @@ def nearest_targets(bins: BrickVolume, voxels: np.ndarray, count: int, seed: int
     chunk = 20_000
     for at in range(0, len(voxels), chunk):
         _nearest(bins.table, bins.bricks, voxels[at : at + chunk], np.uint64(seed), codes[at : at + chunk])
-    unique = np.unique(codes)
-    unique = unique[np.searchsorted(unique, 0) :]
-    found = np.where(codes[:, 0] < 0, -1, np.searchsorted(unique, codes[:, 0]))
-    targets = np.empty((len(unique), 3))
-    _places(unique, bins.brick_index, np.uint64(seed), targets)
+    marks = np.zeros((len(bins.bricks), BRICK**3), np.uint8)
+    touched = np.zeros(len(marks), bool)
+    partial = np.empty(_mark(codes, marks, touched), np.int64)
+    _collect(marks, np.flatnonzero(touched), partial)
+    found, targets = np.empty(len(codes), np.int64), np.empty((len(partial), 3))
+    _rank(codes, partial, found)
+    _places(partial, bins.brick_index, np.uint64(seed), targets)
     return found, targets
 
 
@@ -269,6 +270,45 @@ def _nearest(table, bricks, voxels, seed, codes):
                                 slot -= 1
                             distances[slot] = d
                             codes[n, slot] = code
+
+
+@numba.njit(cache=True)
+def _mark(codes, marks, touched):
+    """Set the bits of target points in the marks (B, 4096) of their voxels, and the bricks that hold any; returns how many."""
+    count = 0
+    for n in range(len(codes)):
+        for code in codes[n]:
+            if code < 0:
+                break
+            row, voxel, bit = code >> 15, (code >> 3) & 4095, np.uint8(1 << (code & 7))
+            if marks[row, voxel] & bit == 0:
+                marks[row, voxel] |= bit
+                touched[row] = True
+                count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def _collect(marks, rows, codes):
+    """Write the codes of all marked points in the bricks `rows`, rising."""
+    at = 0
+    for row in rows:
+        for voxel in range(marks.shape[1]):
+            mark = marks[row, voxel]
+            point = 0
+            while mark:
+                if mark & 1:
+                    codes[at] = (((row << 12) + voxel) << 3) + point
+                    at += 1
+                mark >>= 1
+                point += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _rank(codes, sorted_codes, found):
+    """Where the first of each row of codes is among the sorted ones, -1 where there is none."""
+    for n in numba.prange(len(codes)):
+        found[n] = np.searchsorted(sorted_codes, codes[n, 0]) if codes[n, 0] >= 0 else -1
 
 
 @numba.njit(cache=True, parallel=True)

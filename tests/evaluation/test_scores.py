@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 from ct2hair_addon.evaluation import (
     centre_line_error,
@@ -20,7 +19,6 @@ from ct2hair_addon.evaluation import (
     strand_peak,
 )
 from ct2hair_addon.evaluation.curves import sample_curves
-from ct2hair_addon.evaluation.neighbours import PointGrid
 from ct2hair_addon.evaluation.scores import head_scores, strand_scores, voxel_scores
 from ct2hair_addon.strands import Strands
 from ct2hair_addon.volume import BrickVolume
@@ -40,20 +38,6 @@ def waves(count=150, seed=4) -> Strands:
     across = root + 2.0 * np.sin(z[None, :, None] / 6.0 + phase)
     points = np.concatenate([across, np.broadcast_to(z[None, :, None], (count, len(z), 1))], axis=-1)
     return Strands.from_array(points.astype(np.float32))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_neighbours_are_those_of_scipys_tree(seed):
-    generator = np.random.default_rng(seed)
-    points = (generator.normal(size=(3000, 3)) * [30, 5, 1]).astype(np.float32)
-    queries = (generator.normal(size=(500, 3)) * [35, 8, 4]).astype(np.float32)
-    index, distance = PointGrid.build(points).nearest(queries, 16, 3.0)
-    expected, _ = cKDTree(points.astype(np.float64)).query(queries.astype(np.float64), k=16, distance_upper_bound=3.0)
-    np.testing.assert_allclose(distance, expected, atol=1e-5)
-    known = index >= 0
-    assert known.any() and not known.all()
-    away = np.linalg.norm(points[index[known]].astype(np.float64) - np.repeat(queries, known.sum(axis=1), axis=0), axis=1)
-    np.testing.assert_allclose(away, distance[known], atol=1e-5)
 
 
 def test_a_set_scores_one_against_itself(ball, spikes):

@@ -1,4 +1,4 @@
-"""The nearest points of dense sets, exactly, by a grid of cells: what the strand scores ask millions of times.
+"""The nearest points of dense sets, exactly, by a grid of cells: what strand scores and the paper's fit ask millions of times.
 
 Nearest first, equal distances by index: the same answer on any number of threads.
 """
@@ -15,6 +15,9 @@ CELLS_LIMIT = 1 << 26
 
 OCCUPANCY = 3.0
 """Points wanted per occupied cell: few to look through, few cells to visit."""
+
+SLACK = 1e-6
+"""Share by which the square of a distance may be off, rounded: a cell that begins so little beyond it is looked into."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,13 @@ def _sorted_by(cells, count):
     return start, order
 
 
+@numba.njit(cache=True, inline="always")
+def _beyond(place, index, cell):
+    """Square of how far a place, counted from the first cell, lies outside a cell along an axis."""
+    outside = max(index * cell - place, place - (index + 1) * cell, 0.0)
+    return outside * outside
+
+
 @numba.njit(cache=True)
 def nearest_rows(points, order, start, size, cell, low, x, y, z, reach, rows, squared):
     """Fill `rows` (sorted rows) and `squared` distances with the nearest within `reach`; returns how many. For kernels."""
@@ -106,11 +116,17 @@ def nearest_rows(points, order, start, size, cell, low, x, y, z, reach, rows, sq
     ring = 0
     while True:
         for i in range(max(ci - ring, 0), min(ci + ring, size[0] - 1) + 1):
+            beyond_x = _beyond(x - low[0], i, cell)
+            if beyond_x > limit:
+                continue
             for j in range(max(cj - ring, 0), min(cj + ring, size[1] - 1) + 1):
+                beyond_xy = beyond_x + _beyond(y - low[1], j, cell)
+                if beyond_xy > limit:
+                    continue
                 on_face = abs(i - ci) == ring or abs(j - cj) == ring
                 step = 1 if on_face else max(2 * ring, 1)
                 for k in range(ck - ring, ck + ring + 1, step):
-                    if k < 0 or k >= size[2]:
+                    if k < 0 or k >= size[2] or beyond_xy + _beyond(z - low[2], k, cell) > limit:
                         continue
                     c = (i * size[1] + j) * size[2] + k
                     for row in range(start[c], start[c + 1]):
@@ -131,9 +147,13 @@ def nearest_rows(points, order, start, size, cell, low, x, y, z, reach, rows, sq
                             at -= 1
                         squared[at] = d2
                         rows[at] = row
+                        if found == wanted:
+                            limit = min(limit, squared[wanted - 1] * (1.0 + SLACK))
         clear = inner + ring * cell
-        if clear > 0.0 and clear * clear > (squared[found - 1] if found == wanted else limit):
+        if clear > 0.0 and clear * clear > limit:
             break
+        if max(ci, cj, ck) <= ring and size[0] - ci <= ring and size[1] - cj <= ring and size[2] - ck <= ring:
+            break  # all cells were looked into
         ring += 1
     return found
 
