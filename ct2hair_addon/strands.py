@@ -154,9 +154,10 @@ class Strands:
         ends = np.maximum(self.offsets[1:] - 1, 0)
         return np.where(self.counts > 0, arc[ends] if len(arc) else 0.0, 0.0).astype(np.float32)
 
-    def tangents(self) -> np.ndarray:
-        """(M, 3) float32: unit tangents, central differences inside, one-sided at the ends; 0 where points coincide."""
-        return _tangents(self.points, self.offsets)
+    def tangents(self, reach: int = 1) -> np.ndarray:
+        """(M, 3) float32: unit tangents, from `reach` points before to as many after, cut short at the ends; 0 where these
+        coincide."""
+        return _tangents(self.points, self.offsets, reach)
 
     def polylines(self) -> list[np.ndarray]:
         """The strands as a list of (n, 3) views: for tests and small sets."""
@@ -283,12 +284,12 @@ def _arc_lengths(points, offsets):
 
 
 @numba.njit(cache=True, parallel=True)
-def _tangents(points, offsets):
+def _tangents(points, offsets, reach):
     tangents = np.zeros_like(points)
     for n in numba.prange(len(offsets) - 1):
         start, end = offsets[n], offsets[n + 1]
         for m in range(start, end):
-            before, after = max(m - 1, start), min(m + 1, end - 1)
+            before, after = max(m - reach, start), min(m + reach, end - 1)
             dx = points[after, 0] - points[before, 0]
             dy = points[after, 1] - points[before, 1]
             dz = points[after, 2] - points[before, 2]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import xml.etree.ElementTree as xml
 
 import numpy as np
@@ -12,7 +13,11 @@ from ct2hair_addon.benchmark import Bench, Case, Options, plots, run_benchmark, 
 from ct2hair_addon.benchmark.peers import fullest_cube
 from ct2hair_addon.benchmark.sets import _flags, methods
 from ct2hair_addon.benchmark.tables import PRINTED, Table, cost_table, head_table, shown, table1
-from ct2hair_addon.errors import ScanError, SettingsError
+from ct2hair_addon.errors import CT2HairError, ScanError, SettingsError
+from ct2hair_addon.evaluation import hairstyle, synthesize
+from ct2hair_addon.head import template_head
+from ct2hair_addon.pipeline import Silent
+from ct2hair_addon.settings import Settings
 from ct2hair_addon.volume import BrickVolume
 
 
@@ -49,6 +54,34 @@ def test_plots_are_well_formed_and_in_proportion():
     steps = np.diff(points, axis=0)
     np.testing.assert_allclose(steps[0], steps[1], atol=0.2)  # a power law is straight
     assert steps[0, 0] > 0 > steps[0, 1]
+
+
+class Heard(Silent):
+    def __init__(self) -> None:
+        self.stages = []
+
+    def started(self, stage, text):
+        self.stages.append(stage)
+
+
+def test_a_process_of_its_own_does_the_same_and_says_how_it_goes(tmp_path):
+    scan, head, heard = tmp_path / "scan.vdb", template_head(), Heard()
+    synthesize(hairstyle("pixie", head, 600, 3), head, scan, 1.46, snr=4.0, seed=3)
+    runner._reconstructed_apart(scan, tmp_path / "apart", Settings(), "scan", heard)
+    runner._reconstructed(scan, tmp_path / "here", Settings(), "scan", Silent())
+    apart, here = (json.loads((tmp_path / name / "stage.json").read_text()) for name in ("apart", "here"))
+    assert heard.stages == ["scan"] and apart["scan"] == here["scan"] and apart["thresholds"] == here["thresholds"]
+
+
+def test_what_a_process_of_its_own_refuses_is_raised_here(tmp_path):
+    with pytest.raises(ScanError, match=r"no\.vdb"):
+        runner._reconstructed_apart(tmp_path / "no.vdb", tmp_path / "out", Settings(), None, Silent())
+
+
+def test_a_process_of_its_own_that_dies_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "_work_apart", os._exit)  # which takes no such arguments: the process ends with its traceback
+    with pytest.raises(CT2HairError, match="ended by itself"):
+        runner._reconstructed_apart(tmp_path / "no.vdb", tmp_path / "out", Settings(), None, Silent())
 
 
 def test_the_papers_texels_follow_the_number_of_strands():

@@ -8,17 +8,20 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import multiprocessing
 import os
 import re
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 
+from ..errors import CT2HairError
 from ..evaluation import (
     centre_line_error,
     coverage,
@@ -35,7 +38,7 @@ from ..evaluation import (
 from ..head import Head, HeadMesh, axis_rotation, load_obj, remove_hairnet, template_head
 from ..measure import Meter, machine_memory
 from ..orientation import field_along, orientation_field
-from ..pipeline import Silent, reconstruct
+from ..pipeline import Observer, Silent, reconstruct
 from ..settings import Settings
 from ..strands import Strands
 from ..volume import BrickVolume, load_vdb
@@ -46,6 +49,8 @@ COVERED = 2.5
 """A hair voxel is covered by a guide within this many voxels of the scan: 1 mm at 0.4 mm."""
 ORIENTED = 200_000
 """Hair voxels at most that the orientation error is taken at."""
+DENSE = "dense.npz"
+"""Beside the files of a result: the strands before their refinement."""
 QUERIES = 300_000
 """Millimetres of strand asked at most in each direction: a score's standard error stays under 0.2 %."""
 
@@ -90,10 +95,11 @@ class Scan:
 
 
 class Bench:
-    """A folder of scans, runs and results. say: told, line by line, what is being done."""
+    """A folder of scans, runs and results. say: told, line by line, what is being done. apart: each reconstruction in a process
+    of its own, so that its memory is that of a user's."""
 
-    def __init__(self, folder: Path, say: Say = lambda text: None, keep: bool = False) -> None:
-        self.folder, self.say, self._keep = Path(folder), say, keep
+    def __init__(self, folder: Path, say: Say = lambda text: None, keep: bool = False, apart: bool = False) -> None:
+        self.folder, self.say, self._keep, self._apart = Path(folder), say, keep, apart
         self.load = _load()
 
     def scan(self, case: Case) -> Scan:
@@ -120,7 +126,7 @@ class Bench:
 
     def run(self, case: Case, label: str, settings: Settings, until: str | None = None) -> dict[str, Any]:
         """Everything measured of one method on one scan, as plain values: see `_measured`. until: as in `reconstruct`."""
-        depends = {"settings": settings.to_dict()} | ({"until": until} if until else {})
+        depends = {"settings": settings.to_dict(), "until": until, "apart": self._apart}
         return self.kept(f"{case.name}.{label}", depends, lambda: self._measured(case, label, settings, until))
 
     def kept(self, name: str, depends: dict[str, Any], work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -145,13 +151,14 @@ class Bench:
         folder = self.folder / "runs" / f"{case.name}.{_digest({'sources': sources(), **upstream})[:12]}"
         self.say(f"{case.name}: reconstructing, {label}")
         told = _Told(self.say, f"{case.name}, {label}")
-        made = reconstruct(scan.path, folder, settings, observer=told, until=until)
+        (_reconstructed_apart if self._apart else _reconstructed)(scan.path, folder, settings, until, told)
         self.say(f"{case.name}: scoring, {label}")
-        report = json.loads((folder / ("report.json" if made else "stage.json")).read_text(encoding="utf-8"))
+        report = json.loads((folder / ("stage.json" if until else "report.json")).read_text(encoding="utf-8"))
         found = load_obj(folder / "head.obj", align=False)
-        stages = {} if until == "head" else {"guides": made.guides if made else Strands.load(folder / "guides.npz")}
-        if made:
-            stages |= {"dense": made.dense, "refined": made.hair}
+        files = {} if until == "head" else {"guides": "guides.npz"}
+        if not until:
+            files |= {"dense": DENSE, "refined": "hair.npz"}
+        stages = {stage: Strands.load(folder / file) for stage, file in files.items()}
         head = Head(found)
         density, level = self.density(folder, head, settings), report["scan"]["hair_level"]
         result = {
@@ -169,7 +176,7 @@ class Bench:
             "tallies": {stage["name"]: stage["tally"] for stage in report["stages"]},
             "load": self.load,
         }
-        if made:
+        if not until:
             file = f"pictures/{case.name}.{_plain_name(label)}.jpg"
             shows = _draw(self.folder / file, {"truth": scan.truth, **stages}, np.array(report["head"]["head_to_scan"]), found)
             result["picture"] = {"file": file, "shows": shows}
@@ -236,6 +243,51 @@ class _Told(Silent):
 
     def started(self, stage: str, text: str) -> None:
         self._say(f"{self._name}: {text}")
+
+
+class _Sent(Silent):
+    """Sends on which stage a reconstruction is in."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+
+    def started(self, stage: str, text: str) -> None:
+        self._pipe.send((stage, text))
+
+
+def _reconstructed(scan: Path, folder: Path, settings: Settings, until: str | None, observer: Observer) -> None:
+    """`reconstruct`, with the dense strands beside its files."""
+    made = reconstruct(scan, folder, settings, observer=observer, until=until)
+    if made:
+        made.dense.save(folder / DENSE)
+
+
+def _reconstructed_apart(scan: Path, folder: Path, settings: Settings, until: str | None, observer: Observer) -> None:
+    """The same in a process of its own, whose errors are raised here."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work_apart, args=(theirs, scan, folder, settings, until), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        while (told := ours.recv()) is not None:
+            if isinstance(told, Exception):
+                raise told
+            observer.started(*told)
+        process.join()
+    except EOFError:
+        process.join()
+        raise CT2HairError(f"{scan}: the process that reconstructed it ended by itself ({process.exitcode})") from None
+    finally:
+        process.terminate()
+
+
+def _work_apart(pipe: Connection, scan: Path, folder: Path, settings: Settings, until: str | None) -> None:
+    try:
+        _reconstructed(scan, folder, settings, until, _Sent(pipe))
+        pipe.send(None)
+    except Exception as error:  # handed on: whoever waits at the pipe raises it
+        pipe.send(error)
 
 
 def _load() -> float | None:

@@ -98,7 +98,7 @@ def run_benchmark(name: str, out: Path, options: Options | None = None, say: Say
     if not options.seeds:
         raise SettingsError("a benchmark needs at least one seed")
     out = Path(out)
-    bench = Bench(out, say, options.keep)
+    bench = Bench(out, say, options.keep, apart=name in APART)
     if options.fresh:
         for path in (out / "results").glob("*.json"):
             path.unlink()
@@ -391,6 +391,9 @@ SETS: dict[str, Callable[[Bench, Options], Page]] = {
     "peers": peers,
 }
 """The sets by name."""
+
+APART = ("scale",)
+"""Sets that reconstruct in processes of their own: what was made or compiled before is no part of a stage's memory."""
 
 
 def _notes(options: Options, results) -> list[str]:

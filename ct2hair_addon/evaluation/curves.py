@@ -36,14 +36,6 @@ def sample_curves(strands: Strands, step: float, phase: float = 0.0) -> Strands:
     return Strands(points, offsets, strands.strand_attributes)
 
 
-def sample_tangents(samples: Strands, reach: int) -> np.ndarray:
-    """(M, 3) float32: unit tangents of points sampled at equal steps, from `reach` points before to `reach` after.
-
-    Cut short at the ends; 0 for a strand of a single point.
-    """
-    return _wide_tangents(samples.points, samples.offsets, reach)
-
-
 @numba.njit(cache=True, inline="always")
 def _slope(points, m, axis, before, after):
     """Derivative by chord length at point m, `before` and `after` being the chords on its two sides (0 where none)."""
@@ -171,21 +163,3 @@ def _sampled(points, offsets, arcs, step, phase, starts):
                 for axis in range(3):
                     out[starts[n] + s, axis] = on_curve(curve, t, axis)
     return out
-
-
-@numba.njit(cache=True, parallel=True)
-def _wide_tangents(points, offsets, reach):
-    tangents = np.zeros_like(points)
-    for n in numba.prange(len(offsets) - 1):
-        first, end = offsets[n], offsets[n + 1]
-        for m in range(first, end):
-            a, b = max(m - reach, first), min(m + reach, end - 1)
-            dx = points[b, 0] - points[a, 0]
-            dy = points[b, 1] - points[a, 1]
-            dz = points[b, 2] - points[a, 2]
-            norm = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if norm > 0.0:
-                tangents[m, 0] = dx / norm
-                tangents[m, 1] = dy / norm
-                tangents[m, 2] = dz / norm
-    return tangents

@@ -16,7 +16,7 @@ from ..neighbours import PointGrid, nearest_rows
 from ..progress import Progress, part, silent
 from ..strands import Strands
 from ..volume import BRICK, BrickVolume
-from .curves import curve_arcs, sample_curves, sample_tangents
+from .curves import curve_arcs, sample_curves
 from .density import BLUR, frame_around, render_density, render_layers, strand_peak
 from .spectrum import curvature_spectrum
 
@@ -188,7 +188,7 @@ def direction_share(result: Strands, truth: Strands, queries: int = QUERIES) -> 
     true, found = _Samples(truth), _Samples(result)
     which = _drawn((np.diff(found.offsets) + 1) // 2, queries)
     asked = found.strands.select(which)
-    tangents = sample_tangents(asked, TANGENT_REACH)
+    tangents = asked.tangents(TANGENT_REACH)
     points, tangents = asked.points[::2], tangents[::2]
     right = compared = 0
     for start in range(0, len(points), _PER_CALL):
@@ -324,7 +324,7 @@ class _Samples:
     def __init__(self, strands: Strands) -> None:
         self.strands = samples = sample_curves(strands.select(strands.counts > 0), TARGET_STEP)
         self.points, self.offsets = samples.points, samples.offsets
-        self.tangents = sample_tangents(samples, TANGENT_REACH)
+        self.tangents = samples.tangents(TANGENT_REACH)
         self.strand = samples.strand_index.astype(np.int32)
         self.grid = PointGrid.build(samples.points)
 

@@ -12,7 +12,7 @@ from ct2hair_addon.guides.paper import (
     fine_and_poor,
     grow_poor,
 )
-from ct2hair_addon.head import Head, HeadMesh
+from ct2hair_addon.head import Head
 from ct2hair_addon.orientation import OrientationField
 from ct2hair_addon.settings import GuideSettings
 from ct2hair_addon.strands import Strands
@@ -23,23 +23,9 @@ SETTINGS = GuideSettings(method="paper")
 
 
 @pytest.fixture(scope="module")
-def ball() -> Head:
+def ball(make_ball) -> Head:
     """A sphere of 20 mm around the origin whose upper half is scalp."""
-    rows, columns = 24, 48
-    polar = np.linspace(0, np.pi, rows + 1)[1:-1]
-    around = np.arange(columns) * 2 * np.pi / columns
-    east, north = np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around))
-    ring = np.stack([east, north, np.outer(np.cos(polar), np.ones(columns))], -1)
-    vertices = np.concatenate([[[0, 0, 1]], ring.reshape(-1, 3), [[0, 0, -1]]]) * RADIUS
-    faces = []
-    for c in range(columns):
-        d = (c + 1) % columns
-        faces.append((0, 1 + c, 1 + d))
-        for r in range(rows - 2):
-            a, b, e, f = (1 + r * columns + c, 1 + r * columns + d, 1 + (r + 1) * columns + c, 1 + (r + 1) * columns + d)
-            faces += [(a, e, f), (a, f, b)]
-        faces.append((len(vertices) - 1, 1 + (rows - 2) * columns + d, 1 + (rows - 2) * columns + c))
-    return Head(HeadMesh(vertices, np.array(faces), vertices[:, 2] > 2, np.full((len(vertices), 2), np.nan)))
+    return Head(make_ball(RADIUS, 2.0, rings=24, sides=48))
 
 
 def tubes(curves, shape, radius=1.2, tilt=0.0, seed=0) -> tuple[BrickVolume, BrickVolume]:

@@ -8,7 +8,7 @@ from ct2hair_addon.guides import root_segments
 from ct2hair_addon.guides.direction import fine_ends, signs
 from ct2hair_addon.guides.growing import follow_to_scalp, grow_to_root
 from ct2hair_addon.guides.roots import lead_into_scalp, push_out
-from ct2hair_addon.head import Head, HeadMesh
+from ct2hair_addon.head import Head
 from ct2hair_addon.settings import GuideSettings
 from ct2hair_addon.strands import Strands
 
@@ -16,24 +16,9 @@ RADIUS = 80.0
 
 
 @pytest.fixture(scope="module")
-def ball() -> Head:
+def ball(make_ball) -> Head:
     """A sphere whose upper half is scalp."""
-    rows, columns = 40, 80
-    polar = np.linspace(0, np.pi, rows + 1)[1:-1]
-    around = np.arange(columns) * 2 * np.pi / columns
-    east, north = np.outer(np.sin(polar), np.cos(around)), np.outer(np.sin(polar), np.sin(around))
-    ring = np.stack([east, north, np.outer(np.cos(polar), np.ones(columns))], -1)
-    vertices = np.concatenate([[[0, 0, 1]], ring.reshape(-1, 3), [[0, 0, -1]]]) * RADIUS
-    faces = []
-    for c in range(columns):
-        d = (c + 1) % columns
-        faces.append((0, 1 + c, 1 + d))
-        for r in range(rows - 2):
-            a, b, e, f = (1 + r * columns + c, 1 + r * columns + d, 1 + (r + 1) * columns + c, 1 + (r + 1) * columns + d)
-            faces += [(a, e, f), (a, f, b)]
-        faces.append((len(vertices) - 1, 1 + (rows - 2) * columns + d, 1 + (rows - 2) * columns + c))
-    uv = np.full((len(vertices), 2), np.nan)
-    return Head(HeadMesh(vertices, np.array(faces), vertices[:, 2] > 10, uv))
+    return Head(make_ball(RADIUS, 10.0, sides=80))
 
 
 def hair(azimuth: float, start: float, end: float, lift=0.5) -> np.ndarray:
