@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 
@@ -38,12 +38,10 @@ def openvdb() -> ModuleType:
 
 
 def _bundled_folders() -> list[Path]:
-    """Where a `bpy` wheel in this Python keeps its bundled modules: `bpy/<version>/python/lib/python3.x/site-packages`."""
-    try:
-        wheel = importlib.util.find_spec("bpy")
-    except (ImportError, ValueError):
-        return []
-    if wheel is None:
-        return []
-    roots = list(wheel.submodule_search_locations or []) or [Path(wheel.origin or "").parent]
+    """Where a `bpy` wheel in this Python keeps its bundled modules: `bpy/<version>/python/lib/python3.x/site-packages`.
+
+    All of the path is looked through: once bpy was imported, its scripts, a `bpy` of Python alone among them, come first.
+    """
+    found = (PathFinder.find_spec("bpy", [entry]) for entry in sys.path)
+    roots = [root for spec in found if spec for root in spec.submodule_search_locations or [Path(spec.origin or "").parent]]
     return sorted(folder for root in roots for folder in Path(root).glob("*/python/lib/python3.*/site-packages"))

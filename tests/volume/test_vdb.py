@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
 from ct2hair_addon.errors import ScanError
-from ct2hair_addon.volume import BrickVolume, load_vdb, save_vdb
+from ct2hair_addon.volume import BrickVolume, load_vdb, openvdb_module, save_vdb
 from ct2hair_addon.volume.openvdb_module import openvdb
 
 ORIGIN = (5.0, -7.0, 11.0)
@@ -92,3 +94,20 @@ def test_what_is_no_plain_volume_is_refused(volume, tmp_path):
     vdb.write(str(tmp_path / "flat.vdb"), grids=[grid])
     with pytest.raises(ScanError, match=r"flat\.vdb: the grid's voxels measure .*open it as a scan"):
         load_vdb(tmp_path / "flat.vdb")
+
+
+def test_openvdb_of_the_bpy_wheel_is_found_behind_another_bpy(tmp_path, monkeypatch):
+    # what a process sees that one which has imported bpy spawned: Blender's scripts first, and in them a bpy of Python alone
+    (tmp_path / "scripts" / "bpy").mkdir(parents=True)
+    (tmp_path / "scripts" / "bpy" / "__init__.py").touch()
+    bundled = tmp_path / "wheel" / "bpy" / "4.5" / "python" / "lib" / "python3.11" / "site-packages"
+    bundled.mkdir(parents=True)
+    (tmp_path / "wheel" / "bpy" / "__init__.py").touch()
+    (bundled / "openvdb.py").write_text("here = True")
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "scripts"), str(tmp_path / "wheel")])
+    monkeypatch.delitem(sys.modules, "openvdb", raising=False)
+    assert openvdb_module.openvdb.__wrapped__().here and sys.path == [str(tmp_path / "scripts"), str(tmp_path / "wheel")]
+    (bundled / "openvdb.py").unlink()
+    sys.modules.pop("openvdb")
+    with pytest.raises(ScanError, match="name the folder that holds openvdb in PYTHONPATH"):
+        openvdb_module.openvdb.__wrapped__()
