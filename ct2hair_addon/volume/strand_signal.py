@@ -30,6 +30,11 @@ CORE_RINGS = 7
 """A piece is 9 points a voxel apart; its cross-section is sampled on 12 angles and rings 0, 0.5, ... 5 voxels. Rings up to
 3 voxels (core) hold more than 99 % of a strand's mass at a blur of 0.9; those from 3.5 on (moat) tell whether it is alone."""
 
+STRAIGHT = 0.97
+"""Chord over length from which on a piece is straight."""
+CROWDED, CROWDED_ALL_ROUND = 0.2, 0.08
+"""Shares of a piece's density: what its moat holds at most, along any one angle and all round, where it is alone."""
+
 LONE_EXCESS = 1.15
 """How much higher what is taken for lone strands may stand than a lone strand by the thresholds, both smoothed as there: lone
 ones are at 0.80 to 0.95 of it whatever the blur and the noise; in a braid, where none is alone, the loneliest are at 1.4."""
@@ -38,6 +43,8 @@ MAX_PIECES = 60_000
 MIN_LONE_PIECES = 40
 BEST_SHARE = 0.02
 FLOOR_QUANTILE = 2e-4
+LIKELY_FLOOR = 1.0
+"""mm; hair that the scan shows begins about as far over the head, seldom farther."""
 SLOPE_STEP = 0.25
 """Step of the central differences that give the gradient of the head's distance, mm."""
 
@@ -94,15 +101,15 @@ def lone_profile(
         firsts = firsts[np.linspace(0, len(firsts) - 1, MAX_PIECES).astype(np.int64)]
     voxels = density.to_voxel(lines.points)
     images = np.empty((len(firsts), RINGS, ANGLES), np.float32)
-    straight = np.empty(len(firsts), np.float32)
+    lone = np.empty(len(firsts), bool)
     chunk = 4000
     for start in range(0, len(firsts), chunk):
         progress(start, len(firsts))
         part = slice(start, start + chunk)
         _cross_sections(
-            density.table, density.bricks, np.float32(density.background), voxels, firsts[part], images[part], straight[part]
+            density.table, density.bricks, np.float32(density.background), voxels, firsts[part], images[part], lone[part]
         )
-    measured = _typical_lone(images, straight, hair_level, density.spacing)
+    measured = _typical_lone(images[lone], len(firsts), hair_level, density.spacing)
     if measured is not None:
         return alone(measured, peak, density.spacing)
     axis = images[:, :2].mean(axis=(1, 2)) if len(images) else np.zeros(0)
@@ -112,8 +119,8 @@ def lone_profile(
     return StrandProfile.gaussian(peak, TYPICAL_BLUR, density.spacing)
 
 
-def _typical_lone(images: np.ndarray, straight: np.ndarray, hair_level: float, spacing: float) -> StrandProfile | None:
-    """The profile from polar cross-sections (L, RINGS, ANGLES) of pieces; None where too few run alone."""
+def _typical_lone(images: np.ndarray, pieces: int, hair_level: float, spacing: float) -> StrandProfile | None:
+    """The profile from polar cross-sections (L, RINGS, ANGLES) of those of `pieces` that may run alone; None with too few."""
     if not len(images):
         return None
     radius = RING_STEP * np.arange(RINGS)
@@ -130,13 +137,13 @@ def _typical_lone(images: np.ndarray, straight: np.ndarray, hair_level: float, s
         centre = np.hypot((weight * np.cos(angle)).sum((1, 2)), (weight * np.sin(angle)).sum((1, 2))) / mass
         variance = (core @ (area * radius**2)[:CORE_RINGS] / mass - centre**2) / 2.0 - INTERPOLATION_VARIANCE
     axis = profile[:, :2].mean(axis=1)
-    usable = (axis > hair_level) & (mass > 0.0) & (straight > 0.97) & (centre < 0.8) & np.isfinite(variance)
-    alone = usable & (crowding < 0.2 * axis) & (np.abs(moat) < 0.08 * axis)
+    usable = (axis > hair_level) & (mass > 0.0) & (centre < 0.8) & np.isfinite(variance)
+    alone = usable & (crowding < CROWDED * axis) & (np.abs(moat) < CROWDED_ALL_ROUND * axis)
     if np.count_nonzero(alone) < MIN_LONE_PIECES:
         return None
     rows = np.flatnonzero(alone)
     order = np.argsort(crowding[rows] / axis[rows], kind="stable")
-    rows = rows[order[: max(MIN_LONE_PIECES, int(BEST_SHARE * len(images)))]]
+    rows = rows[order[: max(MIN_LONE_PIECES, int(BEST_SHARE * pieces))]]
     mass_mode = half_sample_mode(mass[rows])
     near = rows[np.abs(mass[rows] - mass_mode) < 0.35 * mass_mode]
     line_mass = float(np.median(mass[near]))
@@ -191,11 +198,15 @@ def data_floor(density: BrickVolume, hair_level: float, head, sample: int = 200_
     if not len(near):
         return 0.0
     keep = max(1, int(np.ceil(per_brick[near].sum() / sample)))
-    row, x, y, z = np.nonzero(density.bricks[near] > hair_level)
-    row, x, y, z = row[::keep], x[::keep], y[::keep], z[::keep]
-    points = density.to_scan(16 * density.brick_index[near[row]] + np.stack([x, y, z], axis=1))
-    distance = head.signed_distance(points.astype(np.float32))
-    return float(max(np.quantile(distance, min(1.0, FLOOR_QUANTILE * total / per_brick[near].sum())), 0.0))
+    hair = density.bricks[near] > hair_level
+    row, *within = np.unravel_index(np.flatnonzero(hair)[::keep], hair.shape)
+    points = density.to_scan(16 * density.brick_index[near[row]] + np.stack(within, axis=1)).astype(np.float32)
+    share, beyond, above = min(1.0, FLOOR_QUANTILE * total / per_brick[near].sum()), LIKELY_FLOOR, np.inf
+    while above >= beyond:  # of all farther points that much is told in a fraction of the time
+        beyond *= 2.0
+        distance = head.signed_distance(points, beyond)
+        floor, above = (np.quantile(distance, share, method=method) for method in ("linear", "higher"))
+    return float(max(floor, 0.0))
 
 
 def outward(points: np.ndarray, head) -> np.ndarray:
@@ -233,23 +244,22 @@ def _piece_starts(offsets: np.ndarray, per_strand: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, parallel=True)
-def _cross_sections(table, bricks, background, voxels, firsts, images, straight):
+def _cross_sections(table, bricks, background, voxels, firsts, images, lone):
+    """Fill the cross-sections `images` (L, RINGS, ANGLES) of the pieces that begin at `firsts`, and `lone` (L,): whether they may
+    run alone. Of those that don't no more than the two innermost rings is sure to be filled: most show it at the first look."""
     for n in numba.prange(len(firsts)):
-        first = firsts[n]
-        tx = voxels[first + PIECE_POINTS - 1, 0] - voxels[first, 0]
-        ty = voxels[first + PIECE_POINTS - 1, 1] - voxels[first, 1]
-        tz = voxels[first + PIECE_POINTS - 1, 2] - voxels[first, 2]
+        piece = voxels[firsts[n] : firsts[n] + PIECE_POINTS]
+        tx, ty, tz = piece[-1, 0] - piece[0, 0], piece[-1, 1] - piece[0, 1], piece[-1, 2] - piece[0, 2]
         chord = np.sqrt(tx * tx + ty * ty + tz * tz)
         arc = 0.0
-        for m in range(first, first + PIECE_POINTS - 1):
+        for m in range(PIECE_POINTS - 1):
             arc += np.sqrt(
-                (voxels[m + 1, 0] - voxels[m, 0]) ** 2
-                + (voxels[m + 1, 1] - voxels[m, 1]) ** 2
-                + (voxels[m + 1, 2] - voxels[m, 2]) ** 2
+                (piece[m + 1, 0] - piece[m, 0]) ** 2
+                + (piece[m + 1, 1] - piece[m, 1]) ** 2
+                + (piece[m + 1, 2] - piece[m, 2]) ** 2
             )
-        straight[n] = chord / arc if arc > 0.0 else 0.0
+        images[n], lone[n] = 0.0, False
         if chord <= 0.0:
-            images[n] = 0.0
             continue
         tx, ty, tz = tx / chord, ty / chord, tz / chord
         ux, uy, uz = ty, -tx, 0.0
@@ -258,21 +268,38 @@ def _cross_sections(table, bricks, background, voxels, firsts, images, straight)
         norm = np.sqrt(ux * ux + uy * uy + uz * uz)
         ux, uy, uz = ux / norm, uy / norm, uz / norm
         vx, vy, vz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
-        for ring in range(RINGS):
+        frame = ux, uy, uz, vx, vy, vz
+        axis = 0.0
+        for step in range(ANGLES):
+            _spoke(table, bricks, background, piece, frame, step, 0, 2, images[n])
+            axis += (images[n, 0, step] + images[n, 1, step]) / (2 * ANGLES)
+        most = 1.001 * CROWDED * axis  # what is nearly too much is left to the exact sums
+        alone = chord > STRAIGHT * arc
+        for step in range(ANGLES):
+            if alone:
+                _spoke(table, bricks, background, piece, frame, step, CORE_RINGS, RINGS, images[n])
+                beside = 0.0
+                for ring in range(CORE_RINGS, RINGS):
+                    beside += images[n, ring, step] / (RINGS - CORE_RINGS)
+                alone = abs(beside) < most
+        if alone:
             for step in range(ANGLES):
-                angle = 2.0 * np.pi * step / ANGLES
-                a, b = RING_STEP * ring * np.cos(angle), RING_STEP * ring * np.sin(angle)
-                total = 0.0
-                for m in range(first, first + PIECE_POINTS):
-                    total += trilinear(
-                        table,
-                        bricks,
-                        background,
-                        voxels[m, 0] + a * ux + b * vx,
-                        voxels[m, 1] + a * uy + b * vy,
-                        voxels[m, 2] + a * uz + b * vz,
-                    )
-                images[n, ring, step] = total / PIECE_POINTS
+                _spoke(table, bricks, background, piece, frame, step, 2, CORE_RINGS, images[n])
+        lone[n] = alone
+
+
+@numba.njit(cache=True)
+def _spoke(table, bricks, background, piece, frame, step, first, last, image):
+    """Fill the rings [first, last) of a piece's cross-section (RINGS, ANGLES) at one angle, averaged along it."""
+    ux, uy, uz, vx, vy, vz = frame
+    angle = 2.0 * np.pi * step / ANGLES
+    for ring in range(first, last):
+        a, b = RING_STEP * ring * np.cos(angle), RING_STEP * ring * np.sin(angle)
+        total = 0.0
+        for m in range(PIECE_POINTS):
+            x, y, z = piece[m, 0] + a * ux + b * vx, piece[m, 1] + a * uy + b * vy, piece[m, 2] + a * uz + b * vz
+            total += trilinear(table, bricks, background, x, y, z)
+        image[ring, step] = total / PIECE_POINTS
 
 
 @numba.njit(cache=True, parallel=True)
