@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 
 from ..head import Head
 from ..settings import GuideSettings
 from ..strands import Strands, nearest_points, normalized, point_tree
+from .coherence import contracted, settled
 
 TANGENT_SPAN = 3.0
 """mm; the length at an end over which its direction is taken: a voxel or two would be noise."""
@@ -17,12 +18,15 @@ VOTE_STEP = 2.0
 """mm between the points that vote on directions."""
 VOTERS = 8
 """Neighbouring points each of them listens to."""
-ROUNDS = 200
-"""Sweeps of the signs at most; they settle in a few dozen."""
 MEETING, MEETING_COST = 30.0, 2.0
 """What a joint of cost 0 between two ends says, in neighbouring points' votes, and the cost by which that falls e-fold."""
 SCALP_HINT = 0.02
 """How much the nearness of an end to the scalp says by itself, against neighbours that say about 1."""
+PASSED, ROOTS_SEEN = 5.0, 0.5
+"""mm over the scalp that strands pass on their way, and the share of those that do of which the roots must be seen to go by
+roots alone: 0.64 and more in loose hair, 0.14 to 0.21 in tied."""
+OPPOSED = 0.5
+"""Share of its neighbours' votes against which a strand is no root's, whatever its end looks like."""
 
 
 def end_tangents(strands: Strands, span: float = TANGENT_SPAN) -> tuple[np.ndarray, np.ndarray]:
@@ -68,14 +72,39 @@ def signs(
     """(N,) float64 in [-1, 1]: above 0 where a strand runs root to tip as it is, below where it must be turned, magnitude
     for certainty.
 
-    Fine strands are sure. The others take the sign that agrees best with their neighbours along the hair: the mean-field
-    solution of a signed graph of strands, an edge the summed agreement of their neighbouring points' tangents. meeting: pairs
-    of strands whose ends meet, with sign and cost (`joints.meeting_ends`): edges too, since hair goes on as it came.
+    Each takes the sign that agrees best with its neighbours along the hair: in a signed graph of strands an edge is the summed
+    agreement of their neighbouring points' tangents. meeting: pairs of strands whose ends meet, with sign and cost
+    (`joints.meeting_ends`): edges too, since hair goes on as it came. Where hair stands off the scalp its roots are seen, and
+    are sure: all other signs follow from these `fine` strands. Where it lies flat few roots are, and of what seems one half is
+    hair that passes close by: the signs by which all of the hair agrees are taken there, if they agree better.
     """
+    graph = _agreements(strands, settings.neighbour_radius, meeting)
+    scale = np.asarray(abs(graph).sum(axis=1)).ravel()
+    low, high = (head.closest_scalp(ends).distance.astype(np.float64) for ends in (strands.roots, strands.tips))
+    hint = SCALP_HINT * np.clip((high - low) / np.maximum(strands.lengths(), 1.0), -1.0, 1.0)
+    by_roots = settled(graph, scale, fine, fine != 0, hint)
+    through = np.count_nonzero((low < PASSED) != (high < PASSED))
+    if np.count_nonzero(fine) >= ROOTS_SEEN * through:
+        return by_roots
+    # whatever is cut near the scalp, as many more strands begin there than end as there are roots
+    leaves = np.exp(-((low / PASSED) ** 2)) - np.exp(-((high / PASSED) ** 2))
+    flow = contracted(graph, fine + leaves)
+    kept = (fine != 0) & (fine * (graph @ flow) > -OPPOSED * scale)
+    by_flow = settled(graph, scale, np.where(kept, fine, flow), kept, leaves / (scale + 1.0))
+    clue = scale * (fine + leaves)
+    return max(by_flow, by_roots, key=lambda value: _agreed(graph, np.sign(value), clue))
+
+
+def _agreed(graph: csr_matrix, sign: np.ndarray, clue: np.ndarray) -> float:
+    """How well signs (N,) agree with one another and with what each strand's own ends tell."""
+    return float(sign @ (graph @ sign) + sign @ clue)
+
+
+def _agreements(strands: Strands, reach: float, meeting) -> csr_matrix:
+    """(N, N) symmetric: by how many votes two strands run the same way (above 0) or against each other."""
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
     tree = point_tree(samples.points)
-    reach = settings.neighbour_radius
     rows, columns, weights = [], [], []
     size = 65536
     for start in range(0, len(samples.points), size):
@@ -103,17 +132,4 @@ def signs(
         pairs, sign, cost = meeting
         weight = MEETING * sign * np.exp(-cost / MEETING_COST)
         graph = graph + coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
-    graph = graph + graph.T
-    scale = np.asarray(abs(graph).sum(axis=1)).ravel()
-    near_root = head.closest_scalp(strands.roots).distance.astype(np.float64)
-    near_tip = head.closest_scalp(strands.tips).distance.astype(np.float64)
-    hint = SCALP_HINT * np.clip((near_tip - near_root) / np.maximum(strands.lengths(), 1.0), -1.0, 1.0)
-    sure = fine != 0
-    value = np.where(sure, fine, 0.0).astype(np.float64)
-    for _ in range(ROUNDS):
-        heard = np.where(sure, fine, np.tanh(3.0 * (graph @ value / np.maximum(scale, 1e-9) + hint)))
-        change = np.abs(heard - value).max(initial=0.0)
-        value = 0.5 * (value + heard)
-        if change < 1e-3:
-            break
-    return value
+    return (graph + graph.T).tocsr()

@@ -211,12 +211,13 @@ def root_segments(
         progress(0.3, 1.0)
         known, merged = strands_by_knots(knots if counted else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
-            pieces.turned(value < 0), fine != 0, scan, strand, part(progress, 0.3, 0.5), known, merged
+            pieces.turned(value < 0), fine * value > 0.0, scan, strand, part(progress, 0.3, 0.5), known, merged
         )
         tally |= {"strands by the knots": known} | joints
     else:
         value = signs(segments, fine, head, settings)
-        directed, rooted, bridged = segments.reversed(value < 0), fine != 0, np.zeros(len(segments), np.float32)
+        directed, rooted, bridged = segments.reversed(value < 0), fine * value > 0.0, np.zeros(len(segments), np.float32)
+    tally["seemingly rooted pieces that run the other way"] = int((fine * value < 0.0).sum())
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
     traced = directed.lengths() - bridged
     seen = directed.resampled_by_step(_step(spacing))

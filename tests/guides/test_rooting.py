@@ -46,6 +46,33 @@ def test_poor_segments_take_the_direction_of_their_neighbours(ball):
     assert (np.sign(value[12:]) == [-1 if n % 2 else 1 for n in range(11)]).all()
 
 
+def coiled(azimuth: float, lands: bool) -> np.ndarray:
+    """A hair that lies on the ball from near its top on, rises off it, and ends high or comes down on the scalp steeply."""
+    s = np.arange(0.0, 110.0, 0.5)
+    polar = 0.2 + np.minimum(s, 80.0) / (RADIUS + 10.0)
+    over = 1.5 + 22.0 * np.clip((s - 20.0) / 30.0, 0.0, 1.0) ** 2
+    over -= np.clip(s - 80.0, 0.0, 22.0) if lands else 0.0
+    polar += 0.002 * np.clip(s - 80.0, 0.0, None) if lands else np.clip(s - 80.0, 0.0, None) / (RADIUS + 20.0)
+    outwards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return (RADIUS + over)[:, None] * (np.sin(polar)[:, None] * outwards + np.cos(polar)[:, None] * [0, 0, 1.0])
+
+
+def test_where_hair_lies_flat_and_comes_back_to_the_scalp_all_of_it_together_tells_its_roots(ball):
+    generator = np.random.default_rng(5)
+    pieces, turned = [], []
+    for n in range(40):
+        cuts = np.sort(generator.integers(20, 190, 2))
+        for part in np.split(coiled(0.05 * n, lands=n % 3 == 0), cuts):
+            turned.append(generator.random() < 0.5)
+            pieces.append(part[::-1] if turned[-1] else part)
+    strands = Strands.from_polylines(pieces)
+    fine = fine_ends(strands, ball, GuideSettings())
+    true = np.where(turned, -1, 1)
+    assert (fine * true < 0).sum() > 3 * (fine * true > 0).sum()  # tips that land look like roots, and roots don't
+    value = signs(strands, fine, ball, GuideSettings())
+    assert np.mean(np.sign(value) == true) > 0.97
+
+
 def test_growing_follows_the_neighbours_in_rounds(ball):
     # Each hair is farther from the only rooted one: the last is out of its reach, not out of its neighbours'.
     lines = [hair(0.0, 2, 80)] + [hair(0.025 * n, 40, 80) for n in range(1, 6)] + [hair(2.5, 40, 80)]
