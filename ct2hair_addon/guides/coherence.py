@@ -12,8 +12,6 @@ ROUNDS = 200
 """Sweeps of the signs at most; they settle in a few dozen."""
 GAIN = 3.0
 """How fast a node grows certain with what it hears."""
-MERGINGS = 64
-"""Rounds of contraction at most: each leaves half of the clusters that still move, so that it is a dozen."""
 
 
 def settled(
@@ -43,7 +41,7 @@ def contracted(graph: csr_matrix, field: np.ndarray) -> np.ndarray:
     """
     graph, field = graph.tocsr(), np.asarray(field, np.float64)
     label, sign, size = np.arange(len(field)), np.ones(len(field)), np.ones(len(field))
-    for _ in range(MERGINGS):
+    while True:
         leader, parity = _strongest(graph, field, size)
         leads = leader == np.arange(len(leader))
         if leads.all():
@@ -60,7 +58,7 @@ def contracted(graph: csr_matrix, field: np.ndarray) -> np.ndarray:
 
 
 def _strongest(graph: csr_matrix, field: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(leader (N,): the node at the end of the chain of strongest bonds that each is in, parity (N,): its sign against that)."""
+    """(leader (N,): the node at the end of each one's chain of strongest bonds, parity (N,): its sign against that)."""
     count = len(field)
     leader, parity = np.arange(count), np.ones(count)
     degree = np.diff(graph.indptr)

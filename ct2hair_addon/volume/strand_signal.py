@@ -245,8 +245,8 @@ def _piece_starts(offsets: np.ndarray, per_strand: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, parallel=True)
 def _cross_sections(table, bricks, background, voxels, firsts, images, lone):
-    """Fill the cross-sections `images` (L, RINGS, ANGLES) of the pieces that begin at `firsts`, and `lone` (L,): whether they may
-    run alone. Of those that don't no more than the two innermost rings is sure to be filled: most show it at the first look."""
+    """Fill the cross-sections `images` (L, RINGS, ANGLES) of the pieces that begin at `firsts`, and `lone` (L,): whether they
+    may run alone. Of those that don't no more than the two innermost rings is sure to be filled: most show it at once."""
     for n in numba.prange(len(firsts)):
         piece = voxels[firsts[n] : firsts[n] + PIECE_POINTS]
         tx, ty, tz = piece[-1, 0] - piece[0, 0], piece[-1, 1] - piece[0, 1], piece[-1, 2] - piece[0, 2]

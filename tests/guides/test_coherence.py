@@ -8,7 +8,6 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from ct2hair_addon.guides.coherence import contracted, settled
 
-
 NEIGHBOURS = [(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)]
 
 
