@@ -77,8 +77,9 @@ def _strongest(graph: csr_matrix, field: np.ndarray, size: np.ndarray) -> tuple[
     first = (leader[leader] == np.arange(count)) & (np.arange(count) < leader) & ~alone[leader]
     alone |= first
     leader[alone], parity[alone] = np.flatnonzero(alone), 1.0
-    while True:
-        further = leader[leader]
-        if (further == leader).all():
-            return leader, parity
-        parity, leader = parity * parity[leader], further
+    for _ in range(count.bit_length()):
+        parity, leader = parity * parity[leader], leader[leader]
+    # bonds that differ by their rounding alone, seen from either end, might close a chain: it waits for the next round
+    closed = leader[leader] != leader
+    leader[closed], parity[closed] = np.flatnonzero(closed), 1.0
+    return leader, parity
