@@ -139,7 +139,8 @@ def find_thresholds(reader: ScanReader, settings: ScanSettings, progress: Progre
 
 
 def _no_hair(reader, air, noise, length, share) -> str:
-    found = f"{length / 1000:.1f} m of them" if length < LEAST_LENGTH else f"{share:.0%} lines"
+    # rounded down: what is just too little doesn't read as enough
+    found = f"{np.floor(length / 100) / 10:g} m of them" if length < LEAST_LENGTH else f"{np.floor(100 * share):g}% lines"
     return (
         f"{reader.path}: no hair was found. Looked for strands, lines a voxel or two wide that stand out of air (value "
         f"{air:.6g}, noise {noise:.3g}): found {found}, expected at least {LEAST_LENGTH / 1000:.0f} m, and {LEAST_SHARE:.0%} "
