@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from ct2hair_addon.evaluation import render_density, strand_peak
 from ct2hair_addon.guides import joints, linking
-from ct2hair_addon.guides.assignment import assign
+from ct2hair_addon.guides.assignment import BID, assign
 from ct2hair_addon.guides.joints import meeting_ends, weighed_joints
 from ct2hair_addon.guides.linking import link_segments
 from ct2hair_addon.guides.pieces import cut_segments
@@ -43,7 +43,7 @@ def farthest(chain, truth):
 @pytest.mark.parametrize("prices", [(20.0,), (2.0, 7.0, 8.0, 20.0)])
 @pytest.mark.parametrize(("rows", "seed"), [(6, 0), (40, 1), (400, 2), (3000, 3)])
 def test_the_assignment_is_the_cheapest(rows, seed, prices):
-    """At once, and going on from what was cheapest when a row without a column cost less."""
+    """To BID a row, at once, and going on from what was cheapest when a row without a column cost less."""
     generator, loose = np.random.default_rng(seed), prices[-1]
     key = np.unique(generator.integers(0, rows * rows, 6 * rows))
     row, column = key // rows, key % rows
@@ -58,7 +58,8 @@ def test_the_assignment_is_the_cheapest(rows, seed, prices):
     places = np.append(row, np.arange(rows)), np.append(column, rows + np.arange(rows))
     graph = coo_matrix((entries, places), shape=(rows, 2 * rows)).tocsr()
     best = np.asarray(graph[min_weight_full_bipartite_matching(graph)]).sum() - rows
-    assert found == pytest.approx(best, rel=1e-9)
+    assert best - 1e-3 < found < best + BID * rows
+    assert found == pytest.approx(best, rel=1e-4)
 
 
 def test_the_price_of_a_loose_row_is_the_first_that_leaves_few_enough():
