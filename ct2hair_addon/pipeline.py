@@ -23,7 +23,7 @@ from . import __version__
 from .checkpoints import Checkpoints, chained_key, fingerprint
 from .errors import CT2HairError
 from .evaluation import write_report
-from .guides import Guides, amend_guides, strands_by_knots, trace_guides
+from .guides import Guides, Habit, amend_guides, strands_by_knots, trace_guides
 from .head import Head, HeadMesh, Registration, load_obj, register_head, remove_hairnet, template_head
 from .interpolation import Dense, estimate_strand_count, fill_scalp
 from .kernels import compiled_ahead
@@ -54,7 +54,8 @@ TRACED, AMENDING = "traced", 0.7
 """The checkpoint within the guides' stage, and how long one amendment takes, tracing taking 1."""
 
 _TYPES = (
-    BrickVolume, Dense, Guides, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds, WigScan,
+    BrickVolume, Dense, Guides, Habit, HeadMesh, OrientationField, Refined, Registration, StrandProfile, Strands, Thresholds,
+    WigScan,
 )  # fmt: skip
 """What checkpoints are made of."""
 
@@ -311,7 +312,7 @@ class _Job:
         fitted = refine(traced, density, level, head, AMENDED_BY, seed, step, profile, device, lone, final=False)
         if not len(fitted.strands):
             return guides
-        usual, known, followed = guides.profile, guides.tally, guides.followed
+        usual, known, habit = guides.profile, guides.tally, guides.habit
         del guides, traced
         pieces, cut = without_surplus(fitted.strands, density, level, head, profile, part(progress, 0.6, 0.65))
         counts = fitted.tally | cut
@@ -323,7 +324,7 @@ class _Job:
         step, wanted = part(progress, 0.75, 1.0), settings.guides
         rest = partial(unexplained, pieces, density, level, head, profile)
         amended = amend_guides(
-            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, wig.counted, followed
+            pieces, rest, density, level, fields.pop(), head, profile, wanted, seed, step, wig.knots, wig.counted, habit
         )
         tally = {f"amended {number}: {name}": count for name, count in (counts | amended.tally).items()}
         return dataclasses.replace(amended, profile=usual, tally=known | tally)

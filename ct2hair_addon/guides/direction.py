@@ -62,12 +62,19 @@ def fine_ends(strands: Strands, head: Head, settings: GuideSettings) -> np.ndarr
     return np.where(np.isfinite(merit.max(axis=0)), sign, 0).astype(np.int8)
 
 
+def roots_seen(strands: Strands, fine: np.ndarray, head: Head) -> bool:
+    """Whether so many strands are `fine` (N,) that the hair's roots are seen, and not only where it happens to stand up."""
+    low, high = (head.closest_scalp(ends).distance < PASSED for ends in (strands.roots, strands.tips))
+    return bool(np.count_nonzero(fine) >= ROOTS_SEEN * np.count_nonzero(low != high))
+
+
 def signs(
     strands: Strands,
     fine: np.ndarray,
     head: Head,
     settings: GuideSettings,
     meeting: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    seen: bool | None = None,
 ) -> np.ndarray:
     """(N,) float64 in [-1, 1]: above 0 where a strand runs root to tip as it is, below where it must be turned, magnitude
     for certainty.
@@ -76,15 +83,15 @@ def signs(
     agreement of their neighbouring points' tangents. meeting: pairs of strands whose ends meet, with sign and cost
     (`joints.meeting_ends`): edges too, since hair goes on as it came. Where hair stands off the scalp its roots are seen, and
     are sure: all other signs follow from these `fine` strands. Where it lies flat few roots are, and of what seems one half is
-    hair that passes close by: the signs by which all of the hair agrees are taken there, if they agree better.
+    hair that passes close by: the signs by which all of the hair agrees are taken there, if they agree better. seen:
+    whether roots are seen (None: `roots_seen` of these).
     """
     graph = _agreements(strands, settings.neighbour_radius, meeting)
     scale = np.asarray(abs(graph).sum(axis=1)).ravel()
     low, high = (head.closest_scalp(ends).distance.astype(np.float64) for ends in (strands.roots, strands.tips))
     hint = SCALP_HINT * np.clip((high - low) / np.maximum(strands.lengths(), 1.0), -1.0, 1.0)
     by_roots = settled(graph, scale, fine, fine != 0, hint)
-    through = np.count_nonzero((low < PASSED) != (high < PASSED))
-    if np.count_nonzero(fine) >= ROOTS_SEEN * through:
+    if roots_seen(strands, fine, head) if seen is None else seen:
         return by_roots
     # whatever is cut near the scalp, as many more strands begin there than end as there are roots
     leaves = np.exp(-((low / PASSED) ** 2)) - np.exp(-((high / PASSED) ** 2))

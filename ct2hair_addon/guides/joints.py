@@ -300,10 +300,16 @@ def _joint(a, b, place, out, bend, root_place, root_out, root_bend, table, brick
     gap = np.sqrt(gap)
     if forward < -1.0 or forward < 0.5 * gap - 1.5:
         return 1e9
+    jump = 0.0
+    for axis in range(3):
+        jump += (bend[a, axis] - root_bend[b, axis]) ** 2
+    apart = jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
+    if apart > most:
+        return apart
     half = 0.5 * max(forward, 0.0)
     best = 1e9
     for curved in range(2):
-        miss = turn = 0.0
+        miss = 0.0
         norm_a = norm_b = dot = 0.0
         for axis in range(3):
             pa, ta = place[a, axis] + half * out[a, axis], out[a, axis]
@@ -317,13 +323,12 @@ def _joint(a, b, place, out, bend, root_place, root_out, root_bend, table, brick
             norm_a += ta * ta
             norm_b += tb * tb
             dot -= ta * tb
-        turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
-        value = miss / (PLACE[0] + PLACE[1] * gap) ** 2 + (turn / (TURN[0] + TURN[1] * gap)) ** 2
+        value = miss / (PLACE[0] + PLACE[1] * gap) ** 2
+        if value < best and value + apart <= most:
+            turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
+            value += (turn / (TURN[0] + TURN[1] * gap)) ** 2
         best = min(best, value)
-    jump = 0.0
-    for axis in range(3):
-        jump += (bend[a, axis] - root_bend[b, axis]) ** 2
-    best += jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
+    best += apart
     if best > most:
         return best
     backed = 0.0

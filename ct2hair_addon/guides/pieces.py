@@ -10,7 +10,7 @@ import numpy as np
 from ..strands import Strands, nearest_points, point_tree, points_around
 
 CONTACT = 2.0
-"""voxel; where a trace ends this close to another's side, the other is cut: it may have come over to the wrong strand there."""
+"""voxel; the trace nearest to another's end, and this close, is cut beside it: one of them may have changed strands there."""
 SHORTEST = 12
 """voxel; no cut is made closer to an end or another cut."""
 KINK = 0.06
@@ -51,7 +51,7 @@ class Pieces:
 
 
 def cut_segments(segments: Strands, voxel: float) -> Pieces:
-    """Undirected segments (mm) in pieces, cut where another one's end lies beside them and where their bend changes at once."""
+    """Undirected segments (mm) in pieces, cut where they are nearest to another's end and where their bend changes at once."""
     lines = segments.resampled_by_step(STEP * voxel)
     if not len(lines):
         return Pieces(lines, np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -63,15 +63,10 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
     row, column = np.nonzero(near < len(some))
     place, end = some[near[row, column]], ends[row]
     beside = (index[place] != index[end]) & (np.abs(np.einsum("nc,nc->n", tangents[place], tangents[end])) > 0.7)
-    place, row, column = place[beside], row[beside], column[beside]
-    # of each line beside an end the nearest point, which the tree gives first
-    order = np.lexsort((column, index[place], row))
-    place, row = place[order], row[order]
-    first = np.ones(len(place), bool)
-    first[1:] = (row[1:] != row[:-1]) | (index[place[1:]] != index[place[:-1]])
-    cuts = np.unique(
-        np.concatenate([place[first], np.flatnonzero(_kinks(lines.points, lines.offsets, voxel, _bend_weights()))])
-    )
+    # the nearest, which the tree gives first
+    nearest = np.unique(row[beside], return_index=True)[1]
+    kinks = np.flatnonzero(_kinks(lines.points, lines.offsets, voxel, _bend_weights()))
+    cuts = np.unique(np.concatenate([place[beside][nearest], kinks]))
     cuts = cuts[(cuts - lines.offsets[index[cuts]] >= SHORTEST) & (lines.offsets[index[cuts] + 1] - cuts > SHORTEST)]
     cuts = cuts[_apart(cuts, SHORTEST)]
     offsets = np.sort(np.concatenate([lines.offsets, cuts]))

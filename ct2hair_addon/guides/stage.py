@@ -14,7 +14,7 @@ from ..settings import GuideSettings
 from ..strands import Strands, concatenate
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, support_along
-from .direction import fine_ends, signs
+from .direction import fine_ends, roots_seen, signs
 from .free_knots import usually_followed
 from .growing import follow_to_scalp, grow_to_root
 from .joints import meeting_ends
@@ -47,18 +47,30 @@ class HairField(Protocol):
 
 
 @dataclass(frozen=True)
+class Habit:
+    """How a wig's hair leaves the scalp, as its first traces tell: fitted guides have been led there and tell nothing of it.
+
+    seen: whether roots are seen (`direction.roots_seen`). followed: how far they had to be followed back to the scalp, mm, the
+    median of those that had; 0 where none had.
+    """
+
+    seen: bool = True
+    followed: float = 0.0
+
+
+@dataclass(frozen=True)
 class Guides:
     """Guide strands: scan frame, mm, root first and on the scalp.
 
     strands: with `support` (N,) float32, the share of the length that was traced in the scan and not grown, and
     `root_uv` (N, 2) float32. profile: what a lone strand looks like in this scan. tally: what was kept and dropped, and why.
-    followed: how far traces had to be followed back to the scalp, mm, the median of those that were; 0 where none was.
+    habit: how the hair leaves the scalp.
     """
 
     strands: Strands
     profile: StrandProfile
     tally: dict[str, int]
-    followed: float = 0.0
+    habit: Habit = Habit()
 
 
 def find_segments(
@@ -131,11 +143,11 @@ def trace_guides(
     del seeds, way
     floor = data_floor(density, hair_level, head)
     step = part(progress, 0.85, 1.0)
-    strands, more, followed = root_segments(
+    strands, more, habit = root_segments(
         segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted
     )
     progress(1, 1)
-    return Guides(strands, profile, tally | more, followed)
+    return Guides(strands, profile, tally | more, habit)
 
 
 def amend_guides(
@@ -151,13 +163,13 @@ def amend_guides(
     progress: Progress = silent,
     knots: np.ndarray | None = None,
     counted: bool = True,
-    followed: float | None = None,
+    habit: Habit | None = None,
 ) -> Guides:
     """Guide strands from `pieces` of fitted ones (mm) and what is traced in the rest of the scan: both are joined and rooted as
     in `trace_guides`, where the other arguments are explained. Their support is what the scan backs.
 
-    unexplained: makes the scan without what the pieces explain, once the orientation field is needed no more. followed: the
-    traced guides' own: what is followed back again is no measure of how far hair runs hidden.
+    unexplained: makes the scan without what the pieces explain, once the orientation field is needed no more. habit: the
+    traced guides' own.
     """
     settings = settings or GuideSettings()
     seeds, way = seed_voxels(field.confidence, field.direction, seed), field.course()
@@ -169,13 +181,13 @@ def amend_guides(
     segments = concatenate([pieces.resampled_by_step(density.spacing), traced])
     floor = data_floor(density, hair_level, head)
     step = part(progress, 0.5, 1.0)
-    strands, tally, followed = root_segments(
-        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted, followed
+    strands, tally, habit = root_segments(
+        segments, density.spacing, head, settings, step, density, profile.seen, knots, floor, counted, habit
     )
     support = support_along(strands, density, hair_level)[1] if len(strands) else np.zeros(0, np.float32)
     progress(1, 1)
     tally = {"pieces": len(pieces), "traced beside them": len(traced)} | tally
-    return Guides(strands.with_attributes(support=support), profile, tally, followed)
+    return Guides(strands.with_attributes(support=support), profile, tally, habit)
 
 
 def root_segments(
@@ -189,10 +201,10 @@ def root_segments(
     knots: np.ndarray | None = None,
     floor: float = 0.0,
     counted: bool = True,
-    followed: float | None = None,
-) -> tuple[Strands, dict[str, int], float]:
+    habit: Habit | None = None,
+) -> tuple[Strands, dict[str, int], Habit]:
     """Directed and rooted strands from undirected segments (mm): Algorithm 1, joints, growing, roots; what became of them; and
-    how far they were followed back to the scalp, mm, as a rule (`followed`, where given).
+    how they leave the scalp (`habit`, where given).
 
     scan, strand: the density and a lone strand's value in it, by which segments are joined; without them they are not.
     knots: (K, 3) mm, where strands are tied to the net; counted: they are as many as the strands. floor: mm over the scalp
@@ -207,7 +219,8 @@ def root_segments(
     if scan is not None and settings.link and len(segments):
         pieces = cut_segments(segments, spacing)
         fine = pieces.ends(fine)
-        value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand))
+        seen = habit.seen if habit else roots_seen(pieces.strands, fine, head)
+        value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand), seen)
         progress(0.3, 1.0)
         known, merged = strands_by_knots(knots if counted else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
@@ -215,13 +228,14 @@ def root_segments(
         )
         tally |= {"strands by the knots": known} | joints
     else:
-        value = signs(segments, fine, head, settings)
+        seen = habit.seen if habit else roots_seen(segments, fine, head)
+        value = signs(segments, fine, head, settings, seen=seen)
         directed, rooted, bridged = segments.reversed(value < 0), fine * value > 0.0, np.zeros(len(segments), np.float32)
     tally["seemingly rooted pieces that run the other way"] = int((fine * value < 0.0).sum())
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())
     traced = directed.lengths() - bridged
-    seen = directed.resampled_by_step(_step(spacing))
-    bodies, low, walked = follow_to_scalp(seen, head, floor + SHOWN * spacing, part(progress, 0.5, 0.6))
+    coarse = directed.resampled_by_step(_step(spacing))
+    bodies, low, walked = follow_to_scalp(coarse, head, floor + SHOWN * spacing, part(progress, 0.5, 0.6))
     tally["followed back through the hair"] = int((walked > 0).sum())
     bodies, reached, grown = grow_to_root(bodies, rooted | low, settings)
     grown += walked
@@ -231,9 +245,9 @@ def root_segments(
     enough = reached & (backed >= settings.min_support)
     tally["dropped: mostly grown"] = int((reached & ~enough).sum())
     kept, backed_length = bodies.select(enough), traced[enough]
-    made = (bodies.counts - seen.counts)[enough]
-    followed = usually_followed(kept, made) if followed is None else followed
-    rooted, tied, late = lead_into_scalp(kept, head, knots, made, part(progress, 0.7, 0.85), followed)
+    made = (bodies.counts - coarse.counts)[enough]
+    habit = habit or Habit(seen, usually_followed(kept, made))
+    rooted, tied, late = lead_into_scalp(kept, head, knots, made, part(progress, 0.7, 0.85), habit.followed)
     tally["roots at knots of the net"] = tied
     tally["led to knots that were left"] = late
     progress(0.85, 1.0)
@@ -246,7 +260,7 @@ def root_segments(
     support = np.clip(backed_length / np.maximum(rooted.lengths(), 1e-6), 0.0, 1.0).astype(np.float32)
     uv = root.uv.astype(np.float32) if root is not None else np.zeros((0, 2), np.float32)
     progress(1.0, 1.0)
-    return Strands(rooted.points, rooted.offsets, {"support": support, "root_uv": uv}), tally, followed
+    return Strands(rooted.points, rooted.offsets, {"support": support, "root_uv": uv}), tally, habit
 
 
 def _step(spacing: float) -> float:
