@@ -158,6 +158,14 @@ def test_a_curl_that_turns_over_at_once_is_cut_there():
     assert len(cut_segments(Strands.from_polylines([arc]), SPACING).strands) == 1
 
 
+def test_of_those_beside_an_end_the_nearest_is_cut():
+    x = np.arange(0.0, 40.0, 0.25)[:, None]
+    near, far, short = x * [1.0, 0, 0], [0.0, 1.0, 0] + x * [1.0, 0, 0], [14.0, 0.4, 0] + x[:50] * [1.0, 0, 0]
+    pieces = cut_segments(Strands.from_polylines([far, near, short]), SPACING)
+    assert pieces.parent.tolist() == [0, 1, 1, 1, 2]
+    np.testing.assert_allclose(pieces.strands.roots[2:4, 0], [14.0, 14.0 + x[49, 0]], atol=SPACING)
+
+
 def test_pieces_turned_against_each_other_do_not_go_on_in_each_other():
     x = np.arange(0.0, 40.0, 0.25)[:, None]
     line, beside = x * [1.0, 0, 0], [20.0, 0.5, 0] + x[:40] * [1.0, 0, 0]

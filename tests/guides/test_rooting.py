@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ct2hair_addon.evaluation import render_density
-from ct2hair_addon.guides import root_segments
-from ct2hair_addon.guides.direction import fine_ends, signs
+from ct2hair_addon.guides import Habit, root_segments
+from ct2hair_addon.guides.direction import fine_ends, roots_seen, signs
 from ct2hair_addon.guides.growing import follow_to_scalp, grow_to_root
 from ct2hair_addon.guides.roots import lead_into_scalp, push_out
 from ct2hair_addon.head import Head
@@ -71,6 +71,13 @@ def test_where_hair_lies_flat_and_comes_back_to_the_scalp_all_of_it_together_tel
     assert (fine * true < 0).sum() > 3 * (fine * true > 0).sum()  # tips that land look like roots, and roots don't
     value = signs(strands, fine, ball, GuideSettings())
     assert np.mean(np.sign(value) == true) > 0.97
+    # fitted guides have been led to the scalp, and their roots are no more to be trusted: it is said which wig it is
+    assert not roots_seen(strands, fine, ball)
+    landed = "seemingly rooted pieces that run the other way"
+    for habit in (Habit(seen=True, followed=7.0), Habit(seen=False, followed=7.0), None):
+        _, tally, told = root_segments(strands, 0.4, ball, GuideSettings(), habit=habit)
+        assert (tally[landed] > 0) == (habit is None or not habit.seen)
+        assert told == habit or (habit is None and not told.seen)
 
 
 def test_growing_follows_the_neighbours_in_rounds(ball):
