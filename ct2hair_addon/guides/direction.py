@@ -73,25 +73,24 @@ def signs(
     fine: np.ndarray,
     head: Head,
     settings: GuideSettings,
+    seen: bool,
     meeting: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    seen: bool | None = None,
 ) -> np.ndarray:
     """(N,) float64 in [-1, 1]: above 0 where a strand runs root to tip as it is, below where it must be turned, magnitude
     for certainty.
 
     Each takes the sign that agrees best with its neighbours along the hair: in a signed graph of strands an edge is the summed
     agreement of their neighbouring points' tangents. meeting: pairs of strands whose ends meet, with sign and cost
-    (`joints.meeting_ends`): edges too, since hair goes on as it came. Where hair stands off the scalp its roots are seen, and
+    (`joints.meeting_ends`): edges too, since hair goes on as it came. Where hair stands off the scalp its roots are `seen`, and
     are sure: all other signs follow from these `fine` strands. Where it lies flat few roots are, and of what seems one half is
-    hair that passes close by: the signs by which all of the hair agrees are taken there, if they agree better. seen:
-    whether roots are seen (None: `roots_seen` of these).
+    hair that passes close by: the signs by which all of the hair agrees are taken there, if they agree better.
     """
     graph = _agreements(strands, settings.neighbour_radius, meeting)
     scale = np.asarray(abs(graph).sum(axis=1)).ravel()
     low, high = (head.closest_scalp(ends).distance.astype(np.float64) for ends in (strands.roots, strands.tips))
     hint = SCALP_HINT * np.clip((high - low) / np.maximum(strands.lengths(), 1.0), -1.0, 1.0)
     by_roots = settled(graph, scale, fine, fine != 0, hint)
-    if roots_seen(strands, fine, head) if seen is None else seen:
+    if seen:
         return by_roots
     # whatever is cut near the scalp, as many more strands begin there than end as there are roots
     leaves = np.exp(-((low / PASSED) ** 2)) - np.exp(-((high / PASSED) ** 2))

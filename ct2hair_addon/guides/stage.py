@@ -220,7 +220,7 @@ def root_segments(
         pieces = cut_segments(segments, spacing)
         fine = pieces.ends(fine)
         seen = habit.seen if habit else roots_seen(pieces.strands, fine, head)
-        value = signs(pieces.strands, fine, head, settings, meeting_ends(pieces, scan, strand), seen)
+        value = signs(pieces.strands, fine, head, settings, seen, meeting_ends(pieces, scan, strand))
         progress(0.3, 1.0)
         known, merged = strands_by_knots(knots if counted else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
@@ -229,7 +229,7 @@ def root_segments(
         tally |= {"strands by the knots": known} | joints
     else:
         seen = habit.seen if habit else roots_seen(segments, fine, head)
-        value = signs(segments, fine, head, settings, seen=seen)
+        value = signs(segments, fine, head, settings, seen)
         directed, rooted, bridged = segments.reversed(value < 0), fine * value > 0.0, np.zeros(len(segments), np.float32)
     tally["seemingly rooted pieces that run the other way"] = int((fine * value < 0.0).sum())
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())

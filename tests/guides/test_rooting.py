@@ -41,7 +41,7 @@ def test_poor_segments_take_the_direction_of_their_neighbours(ball):
     lines += [hair(a, 30, 70)[:: (-1 if n % 2 else 1)] for n, a in enumerate(np.linspace(0.01, 0.29, 11))]
     strands = Strands.from_polylines(lines)
     fine = fine_ends(strands, ball, GuideSettings())
-    value = signs(strands, fine, ball, GuideSettings())
+    value = signs(strands, fine, ball, GuideSettings(), roots_seen(strands, fine, ball))
     assert (value[:12] > 0).all()
     assert (np.sign(value[12:]) == [-1 if n % 2 else 1 for n in range(11)]).all()
 
@@ -69,7 +69,7 @@ def test_where_hair_lies_flat_and_comes_back_to_the_scalp_all_of_it_together_tel
     fine = fine_ends(strands, ball, GuideSettings())
     true = np.where(turned, -1, 1)
     assert (fine * true < 0).sum() > 3 * (fine * true > 0).sum()  # tips that land look like roots, and roots don't
-    value = signs(strands, fine, ball, GuideSettings())
+    value = signs(strands, fine, ball, GuideSettings(), roots_seen(strands, fine, ball))
     assert np.mean(np.sign(value) == true) > 0.97
     # fitted guides have been led to the scalp, and their roots are no more to be trusted: it is said which wig it is
     assert not roots_seen(strands, fine, ball)
