@@ -31,11 +31,14 @@ WALK_AHEAD = WALK_STEP * ((1.0 - WALK_TURN) / WALK_TURN + 0.5)
 """mm ahead that they are asked at: by so much the way lags behind, and over a curved scalp a lag would lead off it."""
 LONGEST_WALK = 150.0
 """mm that a strand is followed back at most."""
+CLOSE, MERGED = 1.0, 10.0
+"""mm: a strand is grown no farther beside its guide than this, and comes so close over this length (e-fold): farther off it
+would lie where there is no hair."""
 
 
 def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) -> tuple[Strands, np.ndarray, np.ndarray]:
     """Grow directed strands that are not `rooted` (N,) back along the nearest rooted one, by its own steps (supplement 2,
-    Algorithm 1).
+    Algorithm 1), but drawn closer to it where it is farther than CLOSE.
 
     Rooted means that the first point is within reach of the scalp. Done in rounds, so that hair far from any fine strand is
     reached over what was grown before. Returns (strands with the grown points put before them, (N,) bool reached,
@@ -71,8 +74,7 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
                 guide = forest[source[slot]][1]
                 strand = np.searchsorted(guide.offsets, place[slot], side="right") - 1
                 path = guide.points[guide.offsets[strand] : place[slot]]
-                shift = strands.points[strands.offsets[n]] - guide.points[place[slot]]
-                parts[n] = path + shift
+                parts[n] = _alongside(path, strands.points[strands.offsets[n]] - guide.points[place[slot]])
                 body = np.concatenate([parts[n], strands.points[strands.offsets[n] : strands.offsets[n + 1]]])
                 grown[n] = np.linalg.norm(np.diff(body[: len(path) + 1], axis=0), axis=1).sum()
                 bodies.append(body)
@@ -85,6 +87,14 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
     points = joined(before.astype(np.float32), offsets_from_counts(counts), strands.points, strands.offsets)
     out = Strands(points, offsets_from_counts(counts + strands.counts))
     return out.with_attributes(**strands.strand_attributes), reached, grown
+
+
+def _alongside(path: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """A guide's `path` (M, 3), moved by `shift` (3,) mm where it ends, and by no more than CLOSE long before that."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    before = np.append(np.cumsum(steps[::-1])[::-1], 0.0)[-len(path) :]
+    close = min(CLOSE / max(float(np.linalg.norm(shift)), 1e-6), 1.0)
+    return path + (close + (1.0 - close) * np.exp(-before / MERGED))[:, None] * shift
 
 
 def _guides_for(ends, tangents, forest, reach):

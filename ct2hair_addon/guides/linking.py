@@ -20,9 +20,11 @@ from .assignment import assign
 from .joints import LOOSE_END, Joints, weighed_joints
 from .pieces import STEP, Pieces
 
-LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
-"""Costs of a tip that goes on nowhere, tried in turn where it is known how many strands there are; the first alone where there
-may be more. Lower ones break good joints, higher ones make none but bad ones."""
+LOOSE_ENDS = (16.0, 20.0, 25.0, 30.0, 40.0, 60.0)
+"""Costs of a tip that goes on nowhere, tried in turn where it is known how many strands there are. Lower ones break good
+joints, higher ones make none but bad ones."""
+AT_LEAST = 20.0
+"""The same where there may be more strands than are known."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
 
@@ -47,7 +49,7 @@ def link_segments(
     rooted = np.asarray(rooted, bool)
     if count < 2:
         return lines, rooted, np.zeros(count, np.float32), {"segments joined": 0}
-    prices = (LOOSE_ENDS[:1] if at_least else LOOSE_ENDS) if known else (LOOSE_END,)
+    prices = ((AT_LEAST,) if at_least else LOOSE_ENDS) if known else (LOOSE_END,)
     joints = weighed_joints(lines, rooted, onward, density, strand, prices[-1], part(progress, 0.0, 0.5))
     following, cut, price = _assigned(count, joints, prices, int((1.0 + SPARE) * known))
     progress(0.9, 1.0)
