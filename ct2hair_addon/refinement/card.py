@@ -89,7 +89,8 @@ class CardPotential:
         for low in range(0, self.own, ROWS):
             model = self.values[low : min(low + ROWS, self.own)].mul_(self.gain)
             weight = 1.0 / (1.0 + model / self.peak)
-            difference = model - self.target[low : low + len(model)].float()
+            scan = self.target[low : low + len(model)]
+            difference = torch.where(scan != 0, model - scan.float(), 0.0)
             error = error + 0.5 * (weight * difference.square()).double().sum()
             torch.mul(weight, difference, out=model)
         self.values[self.own :].zero_()

@@ -62,6 +62,7 @@ def pyramid(density: BrickVolume, blur: float, coarsest: float) -> list[Level]:
         kept = np.sqrt((levels[-1].blur / 2.0) ** 2 + HALVING_VARIANCE)
         extra = np.sqrt(max(LEVEL_BLUR**2 - kept**2, 0.0))
         bricks = blurred(coarse, extra) if extra > 0.2 else coarse.bricks
+        bricks[coarse.bricks == 0.0] = 0.0  # cleared is cleared, whatever lies beside it
         scan = BrickVolume(coarse.table, bricks, coarse.spacing, coarse.origin, coarse.background)
         levels.append(Level(scan, float(np.sqrt(kept**2 + extra**2))))
     return levels[::-1]

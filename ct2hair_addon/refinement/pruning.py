@@ -105,15 +105,18 @@ def excess_of(
     reach: float = 0.0,
     progress: Progress = silent,
 ) -> tuple[np.ndarray, Mark]:
-    """((B, 16, 16, 16) float32: the strands as rendered less the scan, blurred by `reach` voxels; a strand's mark there).
+    """((B, 16, 16, 16) float32: the strands as rendered less the scan, 0 where that was cleared, blurred by `reach` voxels; a
+    strand's mark there).
 
     voxels (M, 3): their points; the rest as for `prune`.
     """
     gain = profile.line_mass / density.spacing**2
     excess = render(voxels, offsets, visible, density, profile.blur, progress)
     for start in range(0, len(excess), CHUNK):
-        excess[start : start + CHUNK] *= np.float32(gain)
-        excess[start : start + CHUNK] -= density.bricks[start : start + CHUNK]
+        part = slice(start, start + CHUNK)
+        excess[part] *= np.float32(gain)
+        excess[part] -= density.bricks[part]
+        excess[part][density.bricks[part] == 0] = 0.0
     if reach:
         blurred(BrickVolume(density.table, excess, density.spacing, density.origin), reach, excess)
     blur = float(np.hypot(profile.blur, reach))
@@ -166,7 +169,8 @@ def prefix(table, excess, scan, bare, points, visible, start, end, peak, seen, e
                     a = amplitude(table, excess, x, y, z, tx / length, ty / length, tz / length, peak, seen)
                 total += shown * length * (0.5 - min(max(a, -1.0), 2.0))
                 if bare > 0.0 and trilinear(table, scan, np.float32(0.0), x, y, z) < bare:
-                    total -= shown * length * BARE_COST
+                    if voxel(table, scan, 1.0, i, j, k) != 0.0:  # it wasn't cleared
+                        total -= shown * length * BARE_COST
             px, py, pz = qx, qy, qz
         earned[m + 1 - start] = total
     return whole

@@ -67,7 +67,8 @@ def misfit(
 
     points, visible: as for `render`; segments: theirs in `target`. gain: density of one voxel of strand length in a voxel.
     `w = 1 / (1 + gain * rendered / peak)`, peak being a lone strand's: noise and model error grow with the hair in a voxel,
-    and one hair more weighs less in a thick bundle. out (., 16, 16, 16) float32, to (B,): where in it each brick goes (`ring`
+    and one hair more weighs less in a thick bundle. Where the target is exactly 0 it was cleared: nothing is known there, and
+    nothing asked. out (., 16, 16, 16) float32, to (B,): where in it each brick goes (`ring`
     keeps three layers). errors (B,): half the weighted square sum of each.
     """
     peak = gain / (2.0 * np.pi * blur**2)
@@ -100,7 +101,8 @@ def _layers(points, visible, segments, volume, blur, gain, peak, out, to, errors
 
 
 def halved(volume: BrickVolume) -> BrickVolume:
-    """The volume at twice the voxel size: means of 2^3 voxels (an average of density keeps its mass)."""
+    """The volume at twice the voxel size: means of those of 2^3 voxels that were not cleared (an average of density keeps its
+    mass); 0 where all were."""
     size = tuple(-(-n // 2) for n in volume.table.shape)
     kept = np.zeros(size, bool)
     index = volume.brick_index
@@ -191,7 +193,7 @@ def _spread_bricks(places, mass, index, rows, target, gain, peak, taps, out, to,
         if peak > 0.0:
             for v in range(BRICK**3):
                 model = gain * shown[v]
-                block[v] = model - np.float32(scan[v])
+                block[v] = model - np.float32(scan[v]) if scan[v] != 0 else np.float32(0.0)
                 shown[v] = block[v] / (np.float32(1.0) + model / peak)
             errors[b] = 0.5 * _dot(shown, block)
         elif gain != 1.0:
@@ -215,9 +217,12 @@ def _halve(bricks, rows, corner, out):
         for x in range(half):
             for y in range(half):
                 for z in range(half):
-                    total = np.float32(0.0)
+                    total, known = np.float32(0.0), 0
                     for a in range(2):
                         for c in range(2):
                             for d in range(2):
-                                total += bricks[b, 2 * x + a, 2 * y + c, 2 * z + d]
-                    out[rows[b], half * corner[b, 0] + x, half * corner[b, 1] + y, half * corner[b, 2] + z] = total / 8
+                                value = bricks[b, 2 * x + a, 2 * y + c, 2 * z + d]
+                                total += value
+                                known += value != 0
+                    mean = total / max(known, 1)
+                    out[rows[b], half * corner[b, 0] + x, half * corner[b, 1] + y, half * corner[b, 2] + z] = mean

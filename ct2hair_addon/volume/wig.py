@@ -65,6 +65,8 @@ MOST_KNOTS = 1024
 """Knots noted in a block of 48^3 voxels."""
 FINE_UNITS, MOST_STRANDS = 32, 16
 """A lone strand is at least so many units of what is stored whole, and so many of them fit in."""
+LEAST = 1e-30
+"""What stands for 0 in a density that is not whole."""
 ENOUGH_BUMPS = 500
 """Knots on the mannequin's skin from which on no others are needed."""
 
@@ -73,7 +75,7 @@ ENOUGH_BUMPS = 500
 class WigScan:
     """A wig as later stages need it, in the scan frame.
 
-    density: BrickVolume, air at 0, the mannequin cleared to 0; int16 in the scan's own units where they are fine enough for
+    density: BrickVolume, air at 0, but exactly 0 only where the mannequin was cleared and nothing is known; int16 in the scan's own units where they are fine enough for
     that (CT numbers are), else float32. hair_level: density above which a voxel is hair.
     knots: (K, 3) float32 mm, blobs denser than strands: knots of the net, and some chance crossings of hair.
     solid_points: (S, 3) float32 mm on the mannequin's outer surface; none without a mannequin. tally: what was kept and left
@@ -498,7 +500,9 @@ def _storage(thresholds: Thresholds) -> type:
 
 @numba.njit(cache=True, parallel=True, nogil=True)
 def _cut_bricks(slab, rows, before, air, whole, out):
-    """Fill out (B, 16, 16, 16) with the slab's bricks `rows` less air; rounded to int16's range with `whole`."""
+    """Fill out (B, 16, 16, 16) with the slab's bricks `rows` less air; rounded to int16's range with `whole`. None is exactly
+    0, which is kept for what is cleared: such voxels take the least values there are, one above 0 and the next below."""
+    least = 1.0 if whole else LEAST
     for n in numba.prange(len(rows)):
         start = np.array([rows[n, 0] * BRICK + before, rows[n, 1] * BRICK, rows[n, 2] * BRICK])
         block = np.empty((BRICK, BRICK, BRICK), np.float32)
@@ -507,7 +511,11 @@ def _cut_bricks(slab, rows, before, air, whole, out):
             for j in range(BRICK):
                 for k in range(BRICK):
                     value = block[i, j, k]
-                    out[n, i, j, k] = min(max(np.rint(value), -32768.0), 32767.0) if whole else value
+                    if whole:
+                        value = min(max(np.rint(value), -32768.0), 32767.0)
+                    if value == 0.0:
+                        value = least if (i + j + k) & 1 else -least
+                    out[n, i, j, k] = value
 
 
 def _kept(table: np.ndarray, bricks: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
