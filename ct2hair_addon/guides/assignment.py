@@ -6,26 +6,28 @@ them; where many want few, as in hair that lies in bundles, shortest augmenting 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numba
 import numpy as np
 
 BID = 1e-3
 """By how much more a row bids than it must: no set of joints is cheaper than the one found by more than this for each row, in
-practice by a millionth (a tip left loose costs 20 and more)."""
+practice by a millionth (a tip left loose costs 16 and more)."""
 SHORT_LIST = 8
 """Columns that a row remembers as its cheapest: prices only rise, so while two of them stay below all the others were, those
 need not be looked at."""
 
 
 def assign(
-    starts: np.ndarray, columns: np.ndarray, costs: np.ndarray, prices: tuple[float, ...], chosen: np.ndarray, most: int = 0
+    starts: np.ndarray, columns: np.ndarray, costs: np.ndarray, prices: Mapping[float, int], chosen: np.ndarray
 ) -> float:
     """Fill `chosen` (R,) int64: each row's column, or -1, at the least sum of costs, to BID a row; a row without one costs the
     price.
 
     Row r may have the columns `columns[starts[r]:starts[r + 1]]`, below R, at `costs`, none below 0. Of the rising `prices` the
-    first that leaves no more than `most` rows without a column is taken, else the last, and returned. What is best at one price
-    is where the next one starts: only rows without a column bid again.
+    first that leaves no more rows without a column than stand beside it is taken, else the last, and returned. What is best at
+    one price is where the next one starts: only rows without a column bid again.
     """
     rows = len(chosen)
     order = np.empty(len(costs), np.int32 if len(costs) < 2**31 else np.int64)
@@ -35,7 +37,7 @@ def assign(
     owner, paid = np.full(rows, -1, np.int64), np.zeros(rows)
     listed, their_costs = np.full((rows, SHORT_LIST), -1, np.int32), np.empty((rows, SHORT_LIST), np.float32)
     others = np.full(rows, -1.0)
-    for price in prices:
+    for price, most in prices.items():
         _auction(starts, columns, costs, price, BID, chosen, owner, paid, listed, their_costs, others)
         if np.count_nonzero(chosen < 0) <= most:
             break

@@ -96,5 +96,5 @@ def chosen_knots(row: np.ndarray, knot: np.ndarray, cost: np.ndarray, roots: int
     row, knot, cost (J,): which of the `knots` each root may have, rows ascending, each pair once.
     """
     chosen = np.full(max(roots, knots), -1, np.int64)
-    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, (LOOSE,), chosen)
+    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, {LOOSE: 0}, chosen)
     return chosen[:roots]

@@ -20,13 +20,13 @@ from .assignment import assign
 from .joints import LOOSE_END, Joints, weighed_joints
 from .pieces import STEP, Pieces
 
-LOOSE_ENDS = (16.0, 20.0, 25.0, 30.0, 40.0, 60.0)
-"""Costs of a tip that goes on nowhere, tried in turn where it is known how many strands there are. Lower ones break good
-joints, higher ones make none but bad ones."""
-AT_LEAST = 20.0
-"""The same where there may be more strands than are known."""
+LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
+"""Costs of a tip that goes on nowhere, tried in turn where it is known how many strands there are; the first alone where there
+may be more. Lower ones break good joints, higher ones make none but bad ones."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
+LOWEST, LACKING = 16.0, 0.01
+"""The cost before those, and the share of strands that must be lacking even so: bad joints are then worse than broken ones."""
 
 
 def link_segments(
@@ -49,9 +49,9 @@ def link_segments(
     rooted = np.asarray(rooted, bool)
     if count < 2:
         return lines, rooted, np.zeros(count, np.float32), {"segments joined": 0}
-    prices = ((AT_LEAST,) if at_least else LOOSE_ENDS) if known else (LOOSE_END,)
-    joints = weighed_joints(lines, rooted, onward, density, strand, prices[-1], part(progress, 0.0, 0.5))
-    following, cut, price = _assigned(count, joints, prices, int((1.0 + SPARE) * known))
+    prices = _prices(known, at_least)
+    joints = weighed_joints(lines, rooted, onward, density, strand, max(prices), part(progress, 0.0, 0.5))
+    following, cut, price = _assigned(count, joints, prices)
     progress(0.9, 1.0)
     following, broken = _without_rings(following, joints)
     chain, position, length = _chains(following)
@@ -72,14 +72,25 @@ def link_segments(
     return Strands(points, offsets), rooted[firsts[order]], bridged, tally
 
 
-def _assigned(count: int, joints: Joints, prices: tuple[float, ...], known: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """(following (N,): the piece that each goes on in, -1 for none; cut (N, 2): points left off its root and its tip; the price
-    of a loose tip) at the least cost: at the first of `prices` that leaves no more than `known` tips loose, or the last."""
+def _prices(known: int, at_least: bool) -> dict[float, int]:
+    """The costs of a loose tip, to be tried in turn, and how many may be left loose at each (see the constants)."""
+    if not known:
+        return {LOOSE_END: 0}
+    spare = int((1.0 + SPARE) * known)
+    if at_least:
+        return {LOOSE_ENDS[0]: spare}
+    return {LOWEST: int((1.0 - LACKING) * known)} | dict.fromkeys(LOOSE_ENDS, spare)
+
+
+def _assigned(count: int, joints: Joints, prices: dict[float, int]) -> tuple[np.ndarray, np.ndarray, float]:
+    """(following (N,): the piece that each goes on in, -1 for none; cut (N, 2): points left off its root and its tip; the cost
+    of a loose tip) at the least cost in all: by the first of `prices` that leaves no more tips loose than it may, or the
+    last."""
     following, cut = np.full(count, -1, np.int64), np.zeros((count, 2), np.int64)
     if not len(joints.cost):
-        return following, cut, prices[0]
+        return following, cut, min(prices)
     starts = np.searchsorted(joints.tip, np.arange(count + 1))
-    price = assign(starts, joints.root, joints.cost, prices, following, known)
+    price = assign(starts, joints.root, joints.cost, prices, following)
     tip = np.flatnonzero(following >= 0)
     root = following[tip]
     key = joints.tip * count + joints.root

@@ -75,8 +75,9 @@ ENOUGH_BUMPS = 500
 class WigScan:
     """A wig as later stages need it, in the scan frame.
 
-    density: BrickVolume, air at 0, but exactly 0 only where the mannequin was cleared and nothing is known; int16 in the scan's own units where they are fine enough for
-    that (CT numbers are), else float32. hair_level: density above which a voxel is hair.
+    density: BrickVolume, air at 0, but exactly 0 only where the mannequin was cleared and nothing is known; int16 in the scan's
+    own units where they are fine enough for that (CT numbers are), else float32. hair_level: density above which a voxel is
+    hair.
     knots: (K, 3) float32 mm, blobs denser than strands: knots of the net, and some chance crossings of hair.
     solid_points: (S, 3) float32 mm on the mannequin's outer surface; none without a mannequin. tally: what was kept and left
     out. warnings: what was assumed.

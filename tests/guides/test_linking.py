@@ -49,7 +49,7 @@ def test_the_assignment_is_the_cheapest(rows, seed, prices):
     row, column = key // rows, key % rows
     cost = generator.uniform(0, 30, len(key))
     starts, chosen = np.searchsorted(row, np.arange(rows + 1)), np.empty(rows, np.int64)
-    assert assign(starts, column, cost, prices, chosen) == loose
+    assert assign(starts, column, cost, dict.fromkeys(prices, 0), chosen) == loose
     has = np.flatnonzero(chosen >= 0)
     assert len(np.unique(chosen[has])) == len(has)
     found = cost[np.searchsorted(key, has * rows + chosen[has])].sum() + loose * (rows - len(has))
@@ -67,7 +67,7 @@ def test_the_price_of_a_loose_row_is_the_first_that_leaves_few_enough():
     starts, columns, costs = np.array([0, 1, 2, 2]), np.array([0, 1]), np.array([15.0, 3.0])
     for most, price, expected in ((3, 2.0, [-1, -1, -1]), (2, 10.0, [-1, 1, -1]), (1, 20.0, [0, 1, -1]), (0, 20.0, [0, 1, -1])):
         chosen = np.empty(3, np.int64)
-        assert assign(starts, columns, costs, (2.0, 10.0, 20.0), chosen, most) == price
+        assert assign(starts, columns, costs, dict.fromkeys((2.0, 10.0, 20.0), most), chosen) == price
         assert chosen.tolist() == expected
 
 
@@ -77,13 +77,14 @@ def test_where_it_is_known_how_many_strands_there_are_joints_are_as_dear_as_need
     along, bent = x * [1.0, 0, 0], x * [np.cos(0.6), np.sin(0.6), 0]
     lines = [along, along + [25.75, 1.2, 0.0], bent + [55.5, 4.2, 0.0]]
     monkeypatch.setattr(linking, "LOOSE_ENDS", (12.0, 15.0, 25.0))
-    monkeypatch.setattr(linking, "AT_LEAST", 15.0)
-    for known, price in ((3, 12), (2, 15), (1, 25)):
+    monkeypatch.setattr(linking, "LOWEST", 8.0)
+    for known, price in ((4, 8), (3, 12), (2, 15), (1, 25)):
         chains, _, _, tally = joined(lines, lines, known=known)
-        assert len(chains) == known and tally["dearest joint allowed"] == price
+        assert len(chains) == min(known, 3) and tally["dearest joint allowed"] == price
     assert len(joined(lines, lines)[0]) == 1, "where it is not known, the usual price"
-    chains, _, _, tally = joined(lines, lines, known=1, at_least=True)
-    assert len(chains) == 2 and tally["dearest joint allowed"] == 15, "there may be more strands: one price"
+    for known in (1, 4):
+        chains, _, _, tally = joined(lines, lines, known=known, at_least=True)
+        assert len(chains) == 3 and tally["dearest joint allowed"] == 12, "there may be more strands: one price"
 
 
 def test_a_gap_is_bridged_along_the_bend():

@@ -35,6 +35,7 @@ def scene():
     scan = render_density(truth, SPACING, BLUR)
     noise = generator.normal(0.0, 0.03, scan.bricks.shape).astype(np.float32)
     scan = BrickVolume(scan.table, scan.bricks + noise, scan.spacing, scan.origin)
+    scan.bricks[:, :5] = 0.0  # cleared
     points, offsets = control_points(truth, 64)
     voxels = scan.to_voxel(points + generator.normal(0.0, 0.2, points.shape))
     visible = np.clip(generator.uniform(-1.0, 2.0, len(points)), 0.0, 1.0)

@@ -170,7 +170,8 @@ def test_the_pyramid_is_coarsest_first_and_each_level_a_rendering_of_its_own_blu
     values = BrickVolume.from_dense(np.ones((64, 64, 64), np.float32), 0.4, (1.0, 2.0, 3.0))
     points = np.linspace([8.0, 20.0, 30.0], [56.0, 44.0, 34.0], 12)
     offsets, visible = np.array([0, 12]), np.ones(12)
-    density = BrickVolume(values.table, render(points, offsets, visible, values, 0.85), 0.4, values.origin)
+    bricks = np.maximum(render(points, offsets, visible, values, 0.85), np.float32(1e-30))  # air, not cleared
+    density = BrickVolume(values.table, bricks, 0.4, values.origin)
     levels = pyramid(density, 0.85, 4.0)
     assert [level.scan.spacing for level in levels] == pytest.approx([1.6, 0.8, 0.4])
     assert levels[-1].scan is density and levels[-1].blur == 0.85

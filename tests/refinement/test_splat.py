@@ -163,6 +163,14 @@ def test_halved_are_means_of_8_in_the_same_frame():
     np.testing.assert_allclose(coarse.to_scan([[0, 0, 0]]), volume.to_scan([[0.5, 0.5, 0.5]]))
 
 
+def test_halved_are_means_of_what_was_not_cleared():
+    values = np.random.default_rng(5).uniform(1.0, 2.0, (16, 16, 16)).astype(np.float32)
+    values[:4, :, 0], values[8:12] = 0.0, 0.0
+    coarse = halved(BrickVolume.from_dense(values, 0.5)).block((0, 0, 0), (8, 8, 8))
+    assert (coarse[4:6] == 0.0).all() and (coarse[:4] > 0.0).all()
+    np.testing.assert_allclose(coarse[0, 0, 0], values[:2, :2, 1].mean(), rtol=1e-6)
+
+
 def misfit_of(points, offsets, visible, target, gain, out):
     """Fill `out` with the misfit; half its weighted square sum."""
     segments, errors = bin_segments(points, offsets, visible, target.table), np.empty(len(out))
@@ -181,6 +189,21 @@ def test_the_misfit_is_what_the_formula_says():
     weight = 1.0 / (1.0 + model / (gain / (2 * np.pi * BLUR**2)))
     np.testing.assert_allclose(out, weight * (model - target.bricks), atol=1e-5)
     assert error == pytest.approx(0.5 * (weight * (model - target.bricks) ** 2).sum(), rel=1e-4)
+
+
+def test_where_the_scan_was_cleared_nothing_is_asked():
+    points, offsets, visible = curves(6)
+    values = np.random.default_rng(6).normal(0.1, 0.05, (48, 48, 48)).astype(np.float32)
+    whole, out = BrickVolume.from_dense(values, 1.0), np.empty((27, 16, 16, 16), np.float32)
+    misfit_of(points, offsets, visible, whole, 0.7, out)
+    expected = out.copy()
+    values[:, 20:, :] = 0.0
+    holed = BrickVolume.from_dense(values, 1.0)
+    error = misfit_of(points, offsets, visible, holed, 0.7, out)
+    known = holed.bricks != 0.0
+    assert (out[~known] == 0.0).all() and (render(points, offsets, visible, holed, BLUR)[~known] > 0.01).any()
+    np.testing.assert_array_equal(out[known], expected[known])
+    assert 0.0 < error < 0.5 * (expected**2).sum() * 100
 
 
 def asked(points, offsets, visible, field, blur):

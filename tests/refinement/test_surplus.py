@@ -8,6 +8,7 @@ import pytest
 from ct2hair_addon.evaluation import render_density
 from ct2hair_addon.refinement import refine, unexplained, without_surplus
 from ct2hair_addon.strands import Strands, concatenate
+from ct2hair_addon.volume import BrickVolume
 from ct2hair_addon.volume.grid import trilinear
 
 SPACING, BLUR, LEVEL = 0.6, 0.85, 0.02
@@ -74,6 +75,19 @@ def test_bent_strands_are_fitted_and_kept_as_curves_not_as_chords(head, profile)
         middle = 0.5 * (points[1:] + points[:-1])
         sag = 0.5 * (radius[1:] + radius[:-1]) - np.hypot(middle[:, 0] + 30.0, middle[:, 2] - 52.0)
         assert np.abs(sag)[5:-5].max() < 0.02 * SPACING
+
+
+@pytest.mark.parametrize(("value", "whole"), [(0.0, True), (1e-30, False)], ids=["cleared", "air"])
+def test_what_runs_where_the_scan_was_cleared_is_no_surplus(scan, head, profile, value, whole):
+    given = concatenate([*map(lane, LANES)])
+    height = scan.origin[2] + SPACING * (16 * scan.brick_index[:, 2, None] + np.arange(16))
+    bricks = np.where((height > 80.0)[:, None, None, :], np.float32(value), np.maximum(scan.bricks, np.float32(1e-30)))
+    holed = BrickVolume(scan.table, bricks, scan.spacing, scan.origin)
+    pieces, rest, cut = judged(given, holed, head, profile)
+    assert (cut == 0) == whole
+    assert pieces.points[:, 2].max() == pytest.approx(112.0 if whole else 80.0, abs=3.0)
+    if whole:
+        assert left_at(rest, LANES[0], 40.0, profile.seen) == 0.0
 
 
 def test_one_that_went_over_is_cut_where_it_doubles_and_its_own_way_is_left(scan, head, profile):

@@ -99,6 +99,26 @@ def test_the_hair_is_kept_and_most_of_the_air_is_not(result, scan, dense):
     assert tally["voxels of the scan"] == values.size
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_exactly_0_is_only_what_was_cleared(result, dense, whole, tmp_path):
+    values, origin = dense
+    density = result.density
+    if not whole:  # too coarse units to be kept whole, and no noise: all air is one value
+        air, strand = result.thresholds.air, result.thresholds.strand
+        coarse = np.maximum(np.rint((values - air) / strand * 8.0), 0.0).astype(np.float32)
+        made = write_scan(tmp_path / "coarse.nrrd", coarse, SPACING, origin)
+        with open_scan(made) as reader:
+            density = import_scan(reader, find_thresholds(reader, ScanSettings())).density
+    assert (density.bricks.dtype == np.int16) == whole
+    row, *inside = np.nonzero(density.bricks == 0)
+    points = density.to_scan(16 * density.brick_index[row] + np.stack(inside, axis=1))
+    assert len(points) > 1000
+    assert np.linalg.norm(points, axis=1).max() < RADIUS + 4.0
+    least = np.abs(density.bricks).astype(np.float64).min(where=density.bricks != 0, initial=np.inf)
+    faint = density.bricks[np.abs(density.bricks) <= 1.0001 * least]
+    assert abs(np.sign(faint, dtype=np.float64).mean()) < 0.1, "as many above 0 as below"
+
+
 def test_at_half_the_signal_noise_is_left_out_and_hair_is_kept(spikes, ball, tmp_path):
     made = synthesize(spikes, ball, tmp_path / "scan.nrrd", SPACING, seed=4, snr=2.0)
     with open_scan(made.files["scan"]) as reader:
@@ -320,7 +340,9 @@ def test_voxels_that_are_no_cubes_are_said_and_resampled(piece, tmp_path):
     values = found.density.block((0, 0, 0), piece.shape)[:, :, ::2]
     kept = values != 0
     assert kept.any()
-    np.testing.assert_allclose(values[kept], piece[:, :, ::2][: values.shape[0]][kept] - np.float32(1000.0), atol=1e-3)
+    expected = piece[:, :, ::2][: values.shape[0]][kept] - np.float32(1000.0)
+    np.testing.assert_allclose(values[kept][expected != 0], expected[expected != 0], atol=1e-3)
+    assert (np.abs(values[kept][expected == 0]) == 1).all()  # 0 is what is cleared
 
 
 def test_no_hair_left_is_refused_with_what_to_do(tmp_path):
