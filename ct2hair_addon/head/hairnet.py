@@ -36,7 +36,8 @@ def remove_hairnet(
     density: BrickVolume, head: Head, settings: HeadSettings, progress: Progress = silent
 ) -> tuple[BrickVolume, dict[str, int]]:
     """`density` (scan frame) with the voxels inside `head`, and those nearer to its scalp than `clearance`, set to the
-    background; bricks that end empty are dropped. Returns it with the counts of what was removed."""
+    background, exactly 0, which no other voxel is; bricks that end empty are dropped. Returns it with the counts of what was
+    removed."""
     bricks = density.bricks.copy()
     index = density.brick_index
     background = bricks.dtype.type(density.background)

@@ -197,7 +197,7 @@ def test_where_the_scan_was_cleared_nothing_is_asked():
     whole, out = BrickVolume.from_dense(values, 1.0), np.empty((27, 16, 16, 16), np.float32)
     misfit_of(points, offsets, visible, whole, 0.7, out)
     expected = out.copy()
-    values[:, 20:, :] = 0.0
+    values[:, 20:30, :] = 0.0
     holed = BrickVolume.from_dense(values, 1.0)
     error = misfit_of(points, offsets, visible, holed, 0.7, out)
     known = holed.bricks != 0.0
