@@ -16,6 +16,7 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..volume import BRICK, BrickVolume
+from ..volume.grid import LEAST
 from .binning import FIRST, LAST, RIM, Segments, bin_segments
 from .blur import WIDE, blur_block, chunks, gaussian_taps, ring, with_rim
 from .curves import segment_samples, spline, spline_at
@@ -225,4 +226,6 @@ def _halve(bricks, rows, corner, out):
                                 total += value
                                 known += value != 0
                     mean = total / max(known, 1)
+                    if mean == 0.0 and known > 0:
+                        mean = LEAST  # air that evens out is no less known
                     out[rows[b], half * corner[b, 0] + x, half * corner[b, 1] + y, half * corner[b, 2] + z] = mean

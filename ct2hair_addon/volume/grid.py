@@ -12,6 +12,8 @@ import numpy as np
 
 BRICK = 16
 """Voxels along one edge of a brick."""
+LEAST = 1e-30
+"""What stands for 0 in a density that is not whole: exactly 0 is what was cleared, of which nothing is known."""
 UNIT = 127.0
 """A direction's unit length where it is stored in int8."""
 

@@ -18,7 +18,7 @@ from ..errors import ScanError
 from ..progress import Progress, silent
 from ..settings import ScanSettings
 from .bodies import CLEAR, Bodies
-from .grid import BRICK, BrickVolume
+from .grid import BRICK, LEAST, BrickVolume
 from .readers import ScanReader
 from .resampling import CubicScan, cubic
 from .structure import (
@@ -65,8 +65,6 @@ MOST_KNOTS = 1024
 """Knots noted in a block of 48^3 voxels."""
 FINE_UNITS, MOST_STRANDS = 32, 16
 """A lone strand is at least so many units of what is stored whole, and so many of them fit in."""
-LEAST = 1e-30
-"""What stands for 0 in a density that is not whole."""
 ENOUGH_BUMPS = 500
 """Knots on the mannequin's skin from which on no others are needed."""
 

@@ -171,6 +171,12 @@ def test_halved_are_means_of_what_was_not_cleared():
     np.testing.assert_allclose(coarse[0, 0, 0], values[:2, :2, 1].mean(), rtol=1e-6)
 
 
+def test_air_that_evens_out_is_not_halved_to_what_was_cleared():
+    even = np.where(np.indices((16, 16, 16)).sum(axis=0) & 1, 1, -1).astype(np.int16)
+    coarse = halved(BrickVolume.from_dense(even, 0.5)).block((0, 0, 0), (8, 8, 8))
+    assert (coarse != 0.0).all() and np.abs(coarse).max() < 1e-20
+
+
 def misfit_of(points, offsets, visible, target, gain, out):
     """Fill `out` with the misfit; half its weighted square sum."""
     segments, errors = bin_segments(points, offsets, visible, target.table), np.empty(len(out))
