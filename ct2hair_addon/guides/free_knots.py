@@ -77,8 +77,8 @@ def lead_to_free_knots(
 
 
 def _passed(way, counts, tree, head, farthest):
-    """Which knots of `tree` the ways (points (S, 3), `counts` (W,) each) pass, `farthest` mm back at most: (owner, knot, cost,
-    step) (J,) each, by owner and knot, each pair once, at the step that passes it the cheapest."""
+    """Which knots of `tree` the ways (points (S, 3), `counts` (W,) each) pass, `farthest` mm back at most and no farther off:
+    (owner, knot, cost, step) (J,) each, by owner and knot, each pair once, at the step that passes it the cheapest."""
     owner, begin = np.repeat(np.arange(len(counts)), counts), np.repeat(offsets_from_counts(counts)[:-1], counts)
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
     back = along - along[begin]
@@ -88,6 +88,9 @@ def _passed(way, counts, tree, head, farthest):
     near, knot = nearest_points(tree, below, candidates, FARTHEST)
     row, column = np.nonzero(np.isfinite(near))
     step, knot = some[row], knot[row, column].astype(np.int64)
+    # a way high over the head or beside the scalp may be above a knot, or nearest to it, and yet far from it
+    within = np.linalg.norm(tree.data[knot] - way[begin[step]], axis=1) <= farthest
+    row, column, step, knot = row[within], column[within], step[within], knot[within]
     cost = (near[row, column] / BESIDE) ** 2 + A_MILLIMETRE * back[step]
     order = np.lexsort((cost, knot, owner[step]))
     order = order[np.unique(owner[step[order]] * tree.n + knot[order], return_index=True)[1]]
@@ -127,11 +130,12 @@ def _relaid(strands, made, won, knot, way, begin, at, head):
     owner = np.repeat(np.arange(len(won)), counts[won])
     step = np.repeat(last, counts[won]) - (np.arange(offsets[-1]) - offsets[won][owner])
     share = ((step - begin[owner]) / np.maximum(at - begin, 1)[owner])[:, None]
-    height = np.maximum(head.signed_distance(way), LOW)
-    rising = np.minimum(LOW + (height[begin[owner]] - LOW) * (1.0 - share[:, 0]), height[step])
+    height = head.signed_distance(way)
+    ceiling = np.maximum(height, LOW)
+    rising = np.minimum(LOW + (ceiling[begin[owner]] - LOW) * (1.0 - share[:, 0]), ceiling[step])
     aside = knot - head.closest_scalp(way[at]).position
-    below = head.closest_scalp(way[step])
-    points = below.position + share * aside[owner] + rising[:, None] * below.normal
+    # relative to the way: beside the scalp, over a brow or an ear, all that is closest there is the scalp's edge
+    points = way[step] + share * aside[owner] + (rising - height[step])[:, None] * head.closest_scalp(way[step]).normal
     cut = np.where(tied, made, 0)
     keep = np.arange(len(strands.points)) - np.repeat(strands.offsets[:-1], strands.counts) >= np.repeat(cut, strands.counts)
     traced, traced_offsets = strands.points[keep], offsets_from_counts(strands.counts - cut)

@@ -133,3 +133,35 @@ def test_strands_followed_past_their_knots_come_back_to_them(ball, stream):
     assert late == len(rest) and tied >= len(rest)
     np.testing.assert_allclose(rooted.roots[rest], knots, atol=0.05)
     assert ball.signed_distance(rooted.points).min() > -0.2
+
+
+def test_a_knot_far_below_a_way_is_none_that_it_passed(ball):
+    """Hair streams high over the head: a knot below it is 30 mm from where the strand is seen, however short its way there."""
+
+    def high(azimuth: float, start: float) -> np.ndarray:
+        s = np.arange(start, 70.0, WALK_STEP)
+        return place(azimuth, s, 30.0 + 0.0 * s)
+
+    late = APART * 5.5
+    strands = Strands.from_polylines([*(high(APART * n, 0.0) for n in range(12)), high(late, 30.0)])
+    knot = np.array(ball.closest_scalp(place(late, [24.0], 0.0)).position, float)
+    asked = strands, np.zeros(13, int), np.array([12]), knot, ball
+    led, _, tied = lead_to_free_knots(*asked, usual=20.0 / AS_FAR)
+    assert not tied.any()
+    np.testing.assert_array_equal(led.points, strands.points)
+    assert lead_to_free_knots(*asked, usual=40.0 / AS_FAR)[2][12]
+
+
+def test_hair_that_passes_beside_the_scalp_makes_no_jump_to_its_edge(make_ball):
+    """A way from the scalp's rim down beside it: what is laid anew stays by it, though the closest scalp is but its edge."""
+    bald_below = Head(make_ball(RADIUS, scalp_over=RADIUS * np.cos(0.4 + 12.0 / RADIUS), rings=90, sides=180))
+    late = APART * 5.5
+    strands = Strands.from_polylines([*(lying(APART * n, 0.0, 90.0) for n in range(12)), lying(late, 60.0, 90.0)])
+    knot = np.array(bald_below.closest_scalp(place(late, [8.0], 0.0)).position, float)
+    led, _, tied = lead_to_free_knots(strands, np.zeros(13, int), np.array([12]), knot, bald_below, usual=80.0 / AS_FAR)
+    assert tied[12]
+    line = led.polylines()[12]
+    assert len(line) > strands.counts[12] + 40
+    assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() < 1.6
+    assert np.linalg.norm(line[0] - knot[0]) < 6.0
+    assert bald_below.signed_distance(line).min() > 0.4
