@@ -8,7 +8,6 @@ import numpy as np
 from ..head import Head
 from ..progress import Progress, silent
 from ..strands import Strands, normalized, offsets_from_counts
-from ..volume.strand_signal import outward
 from .direction import end_tangents
 from .free_knots import lead_to_free_knots
 from .growing import course_around, joined
@@ -106,7 +105,7 @@ def push_out(strands: Strands, head: Head) -> tuple[Strands, int]:
     for _ in range(4):
         if not len(moved):
             break
-        points[moved] += outward(points[moved], head) * (CLEARANCE * 1.5 - depth[moved])[:, None]
+        points[moved] += head.outward(points[moved]) * (CLEARANCE * 1.5 - depth[moved])[:, None]
         depth[moved] = head.signed_distance(points[moved])
         moved = moved[depth[moved] < CLEARANCE]
     return strands.with_points(points.astype(np.float32)), total

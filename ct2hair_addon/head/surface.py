@@ -15,6 +15,8 @@ from .nearest import CHUNK, TriangleTree, box_distance2, nearest_one, winding_on
 
 CELLS = 192
 """Cells along one edge of the texture-space grid: one to three triangles each for scalps of some 10,000 triangles."""
+ON_SURFACE = 1e-3
+"""mm from the surface within which the way to it is rounding."""
 SIDES = 4.0
 """Grid on which inside and outside are tabulated, mm: 300,000 nodes for a head."""
 PEEK, PEEKED = 0.01, 0.8
@@ -151,6 +153,17 @@ class Head:
             )  # fmt: skip
         return out
 
+    def outward(self, points: np.ndarray) -> np.ndarray:
+        """(M, 3) float64 unit gradients of the signed distance at `points` (M, 3): from the nearest place of the closed head,
+        to it for points inside; on the surface itself the triangle's normal."""
+        points = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
+        out = np.empty((len(points), 3))
+        tree = self.solid_tree
+        for start in range(0, len(points), CHUNK):
+            part = slice(start, start + CHUNK)
+            _outward(points[part], *tree.arrays, tree.centre, tree.dipole, tree.radius, *self.sides, self.walls, out[part])
+        return out
+
     def closest_scalp(self, points: np.ndarray, reach: float = np.inf) -> ScalpPoints:
         """The closest point on the scalp to each of `points` (M, 3); face -1 where none is within `reach` mm."""
         distance, slot, bary = self.scalp_tree.nearest(points, reach)
@@ -265,6 +278,27 @@ def _signed_distance(
         d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, (abs(node) + off + 1e-3) ** 2)
         inside = inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z)
         out[n] = -np.sqrt(d2) if inside else np.sqrt(d2)
+
+
+@numba.njit(cache=True, parallel=True, nogil=True)
+def _outward(points, boxes, child, first, count, order, corners, centre, dipole, radius, low, sides, walls, out):
+    for n in numba.prange(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
+        dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
+        known = abs(sides[i, j, k]) + np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-3
+        d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, known * known)
+        ax, ay, az = corners[slot, 0], corners[slot, 1], corners[slot, 2]
+        ux, uy, uz = corners[slot, 3] - ax, corners[slot, 4] - ay, corners[slot, 5] - az
+        vx, vy, vz = corners[slot, 6] - ax, corners[slot, 7] - ay, corners[slot, 8] - az
+        if d2 < ON_SURFACE * ON_SURFACE:
+            dx, dy, dz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        else:
+            dx, dy, dz = x - ax - v * ux - w * vx, y - ay - v * uy - w * vy, z - az - v * uz - w * vz
+            if inside_one(boxes, child, first, count, corners, centre, dipole, radius, low, sides, walls, slot, v, w, x, y, z):
+                dx, dy, dz = -dx, -dy, -dz
+        norm = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-30)
+        out[n, 0], out[n, 1], out[n, 2] = dx / norm, dy / norm, dz / norm
 
 
 @numba.njit(cache=True, inline="always")

@@ -12,7 +12,7 @@ from ..progress import Progress, part, silent
 from ..settings import InterpolationSettings
 from ..strands import Strands, concatenate, normalized
 from ..volume import BrickVolume
-from ..volume.strand_signal import outward, support_along
+from ..volume.strand_signal import support_along
 from .coder import SHAPE_POINTS, Coder, LinearCoder, blend, chosen_coder
 from .phase import LEAST_SWING, in_phase, swing_share
 from .texture import SIDE, drawn_texels, eq3_weights, texels_of
@@ -277,7 +277,7 @@ def _outside(strands: np.ndarray, head, progress: Progress) -> tuple[np.ndarray,
             still.append(some[inside])
             push = np.zeros((len(inside), *points.shape[1:]))
             deep = depth[inside] > 0.0
-            push[deep] = depth[inside][deep][:, None] * outward(points[inside][deep], head)
+            push[deep] = depth[inside][deep][:, None] * head.outward(points[inside][deep])
             # The last rounds push point by point: what spreading leaves inside must come out, too.
             strands[some[inside], 1:] += _spread_along(push) if attempt < PUSHES - 2 else push
         rows = np.concatenate(still) if still else np.zeros(0, np.int64)

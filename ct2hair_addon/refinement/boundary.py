@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..volume.strand_signal import outward
 from .motion import keep_outside
 
 NEAR = 4.0
@@ -17,9 +16,8 @@ LAST_PUSHES = 6
 class Boundary:
     """The head's tangent planes near strands, taken anew by `look`; `push` moves points out of them.
 
-    head answers `signed_distance(points (M, 3) float32, beyond) -> (M,)` as `Head` does, mm, negative inside. floor: distance
-    from the head, mm, below which the scan shows no hair (net cut away). ramp: mm over which strands fade in above it, a voxel
-    of the scan.
+    head answers `signed_distance` and `outward` as `Head` does. floor: distance from the head, mm, below which the scan shows
+    no hair (net cut away). ramp: mm over which strands fade in above it, a voxel of the scan.
     """
 
     def __init__(self, head, floor: float, ramp: float) -> None:
@@ -44,7 +42,7 @@ class Boundary:
         self.near = self._distance < NEAR
         self.plane = np.zeros((len(points), 4))
         rows = np.flatnonzero(self.near)
-        normal = outward(points[rows], self.head)
+        normal = self.head.outward(points[rows])
         self.plane[rows, :3] = normal
         self.plane[rows, 3] = np.einsum("ij,ij->i", normal, points[rows]) - self._distance[rows]
         if self.floor <= 0.0:
@@ -69,5 +67,5 @@ class Boundary:
             found = found or len(rows)
             if not len(rows):
                 break
-            points[rows] += (MARGIN - distance + 0.02 * attempt)[:, None] * outward(points[rows], self.head)
+            points[rows] += (MARGIN - distance + 0.02 * attempt)[:, None] * self.head.outward(points[rows])
         return points, found

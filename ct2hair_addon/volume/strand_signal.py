@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from ..progress import Progress, silent
-from ..strands import Strands, normalized
+from ..strands import Strands
 from .grid import BrickVolume, trilinear
 from .structure import SMOOTHING, STRAND_BLUR
 
@@ -45,8 +45,6 @@ BEST_SHARE = 0.02
 FLOOR_QUANTILE = 2e-4
 LIKELY_FLOOR = 1.0
 """mm; hair that the scan shows begins about as far over the head, seldom farther."""
-SLOPE_STEP = 0.25
-"""Step of the central differences that give the gradient of the head's distance, mm."""
 
 
 @dataclass(frozen=True)
@@ -207,14 +205,6 @@ def data_floor(density: BrickVolume, hair_level: float, head, sample: int = 200_
         distance = head.signed_distance(points, beyond)
         floor, above = (np.quantile(distance, share, method=method) for method in ("linear", "higher"))
     return float(max(floor, 0.0))
-
-
-def outward(points: np.ndarray, head) -> np.ndarray:
-    """(M, 3) float64 unit gradients of the head's distance at `points`, by central differences."""
-    steps = SLOPE_STEP * np.concatenate([np.eye(3), -np.eye(3)])
-    values = head.signed_distance((points[None] + steps[:, None]).reshape(-1, 3).astype(np.float32))
-    values = np.asarray(values, np.float64).reshape(6, -1)
-    return normalized((values[:3] - values[3:]).T)
 
 
 def support_along(

@@ -43,6 +43,30 @@ def test_the_signed_distance_is_the_trees_and_the_winding_numbers(template_queri
     np.testing.assert_allclose(template_queries.signed_distance(points), expected, atol=1e-4)
 
 
+def test_outward_is_the_slope_of_the_signed_distance(template_queries):
+    generator = np.random.default_rng(10)
+    points = template_queries.mesh.vertices[generator.integers(0, 20_000, 3000)] + generator.normal(0, 3.0, (3000, 3))
+    found, h = template_queries.outward(points), 0.01
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-9)
+    steps = h * np.concatenate([np.eye(3), -np.eye(3)])
+    values = template_queries.signed_distance((points[None] + steps[:, None]).reshape(-1, 3)).astype(float).reshape(6, -1)
+    slope = (values[:3] - values[3:]).T / (2.0 * h)
+    smooth = np.abs(np.linalg.norm(slope, axis=1) - 1.0) < 0.01  # not where two places of the head are equally near
+    assert smooth.mean() > 0.95
+    assert np.einsum("ni,ni->n", found, slope)[smooth].min() > 0.99
+    assert np.quantile(np.einsum("ni,ni->n", found, slope), 0.05) > 0.95
+
+
+def test_outward_on_the_surface_is_the_triangles_normal(template_queries):
+    mesh = template_queries.mesh
+    corner = mesh.vertices.astype(np.float64)[mesh.faces[::50]]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    found = template_queries.outward(corner.mean(axis=1))
+    assert np.quantile(np.einsum("ni,ni->n", found, normal), 0.02) > 0.99
+    assert template_queries.outward(np.zeros((0, 3))).shape == (0, 3)
+
+
 def test_where_a_mesh_runs_through_itself_the_inner_walls_are_none(ball):
     """A second ball is sunk into the first, below its scalp: what of each lies in the other has the inside on both sides."""
     moved = ball.vertices + np.float32([0.0, 0.0, -60.0])
