@@ -11,6 +11,9 @@ NEAR = 4.0
 MARGIN = 0.05
 """Distance, mm, that free points keep from the head."""
 LAST_PUSHES = 6
+LEAVES, STANDS, BESIDE = 0.18, 0.6, 12.0
+"""Slope at which hair leaves the scalp at least (10 degrees), up to how far over it, and along how much of it, mm: there the
+scan shows none, and what holds a curve straight would lay it onto the skin."""
 
 
 class Boundary:
@@ -52,6 +55,18 @@ class Boundary:
     def push(self, points: np.ndarray, offsets: np.ndarray) -> None:
         """Move points inside the planes out of them, in place; roots stay."""
         keep_outside(points, offsets, self.near, self.plane, MARGIN)
+
+    def raised(self, points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Points (M, 3), those by the roots of strands as high over the head as hair stands there (see the constants)."""
+        points = np.array(points, np.float64)
+        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))[: len(points)]
+        along -= np.repeat(along[offsets[:-1]], np.diff(offsets))
+        rows = np.flatnonzero((along > 0.0) & (along < BESIDE))
+        height = np.minimum(STANDS, LEAVES * np.minimum(along[rows], BESIDE - along[rows]))
+        lack = height - np.asarray(self.head.signed_distance(points[rows].astype(np.float32), STANDS), np.float64)
+        rows, lack = rows[lack > 0.0], lack[lack > 0.0]
+        points[rows] += lack[:, None] * self.head.outward(points[rows])
+        return points
 
     def clear(self, points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, int]:
         """Points (M, 3) with none inside the head but roots, and how many were. Exact, by repeated pushes."""

@@ -120,6 +120,8 @@ def refine(
             step = part(progress, 0.88, 0.9)
             points, moved = settle_tips(points, offsets, boundary.look(points), density, profile, traced, step)
             tally["tips moved out"], tally["tips moved in"] = int((moved > 0.0).sum()), int((moved < 0.0).sum())
+    if settings.iterations and settings.method == "volume":
+        points = boundary.raised(points, offsets)
     if not final:
         progress(1.0, 1.0)
         return Refined(Strands(*even_lines(points, offsets, EVEN * density.spacing), kept.strand_attributes), tally, {})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from ct2hair_addon.refinement.boundary import MARGIN, Boundary
+from ct2hair_addon.refinement.boundary import LEAVES, MARGIN, STANDS, Boundary
 from ct2hair_addon.refinement.curves import _evaluate_cubics, control_points, local_curvature, polylines, segment_lengths
 from ct2hair_addon.refinement.fit import SMOOTH_TURN, pyramid, shares
 from ct2hair_addon.refinement.motion import keep_lengths, smooth_step, solve_bands
@@ -110,6 +110,21 @@ def test_points_are_pushed_off_the_head_but_roots(head):
     cleared, count = boundary.clear(inside, offsets)
     assert head.signed_distance(cleared[free]).min() > 0
     assert count == np.count_nonzero(head.signed_distance(inside[free]) < 0.5 * MARGIN)
+
+
+def test_hair_rises_from_its_root_but_what_stands_and_what_lies_farther_on_stays(head):
+    along = np.arange(0.0, 20.0, 1.0)
+    lying = 40.1 * np.stack([np.sin(along / 40.1), 0.0 * along, np.cos(along / 40.1)], axis=1)
+    lying[0] *= 40.0 / 40.1
+    standing = np.array([0.0, 40.0, 0.0]) + along[:, None] * [0.2, 0.9, 0.0]
+    points, offsets = np.concatenate([lying, standing, lying[:1]]), np.array([0, 20, 40, 41])
+    raised = Boundary(head, 0.0, 0.6).raised(points, offsets)
+    height = head.signed_distance(raised[:20])
+    np.testing.assert_allclose(height[1:4], LEAVES * along[1:4], atol=0.05)
+    np.testing.assert_allclose(height[4:9], STANDS, atol=0.05)
+    kept = np.append(np.arange(12, 41), 0)
+    np.testing.assert_array_equal(raised[kept], points[kept])
+    assert Boundary(head, 0.0, 0.6).raised(points[:0], np.zeros(1, int)).shape == (0, 3)
 
 
 def test_what_the_net_hides_fades_in_over_a_voxel(head):
