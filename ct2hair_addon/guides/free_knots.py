@@ -17,15 +17,19 @@ from .knots import chosen_knots
 
 BESIDE = 1.2
 """mm beside a strand's way back over the scalp that its knot is usually off."""
-FARTHEST = 4.0 * BESIDE
-"""mm; a knot farther beside it is none of the strand's."""
+FARTHEST, ASIDE = 4.0 * BESIDE, 0.1
+"""mm, and share of how far back knots are looked for, that one may lie beside it at most: strands make room for each other."""
+FAR, FAR_COST = 2.0, 4.0
+"""How many times BESIDE a knot costs the square of how far beside it is, and what each time more costs from there on."""
+WITHOUT = 60.0
+"""Cost of a strand without a knot: dearer than the dearest knot."""
 A_MILLIMETRE = 0.04
 """Cost of a millimetre back along that way: of two knots the nearer one."""
 AS_FAR = 4.0
 """How far back knots are looked for, in the median of how far strands of the wig had to be followed: where hair stands up that
 is a few millimetres, and a strand without a knot is one too many."""
-CANDIDATES = 4
-"""Knots looked at beside each step."""
+CANDIDATES, EVERY = 32, 4
+"""Knots looked at beside each so manieth step."""
 LEAVING = 4.0
 """mm behind its knot at which a strand is among the hair."""
 LOW = 0.8
@@ -53,9 +57,9 @@ def lead_to_free_knots(
 
     made (N,): points at the root of each that were not traced. usual: how far the wig's strands usually had to be followed, mm
     (None: these, `usually_followed`). Each knot goes to one strand at most, so that they are as near as possible beside the
-    strands' ways over the scalp, and not far back. A strand runs from its knot, over the way that it was followed, up to where
-    it was traced, and nowhere higher than that way; one without a knot stays as it is. Returns (strands, (N, 3) float64 the
-    knots, (N,) bool which have one).
+    strands' ways over the scalp, and not far back; where hair is hidden for long, most have one. A strand runs from its knot,
+    over the way that it was followed, up to where it was traced, and nowhere higher than that way; one without a knot stays as
+    it is. Returns (strands, (N, 3) float64 the knots, (N,) bool which have one).
     """
     knots, tied = np.zeros((len(strands), 3)), np.zeros(len(strands), bool)
     farthest = AS_FAR * (usually_followed(strands, made) if usual is None else usual)
@@ -70,7 +74,7 @@ def lead_to_free_knots(
         owner, knot, cost, step = _passed(way[offsets[low] : offsets[high]], counts[low:high], tree, head, farthest)
         parts.append((owner + low, knot, cost, step + offsets[low]))
     owner, knot, cost, step = (np.concatenate(column) for column in zip(*parts, strict=True))
-    chosen = chosen_knots(owner, knot, cost, len(rest), len(free))
+    chosen = chosen_knots(owner, knot, cost, len(rest), len(free), WITHOUT)
     won = np.flatnonzero(chosen >= 0)
     at = step[np.searchsorted(owner * len(free) + knot, won * len(free) + chosen[won])]
     return _relaid(strands, made, rest[won], free[chosen[won]], way, offsets[won], at, head)
@@ -82,16 +86,17 @@ def _passed(way, counts, tree, head, farthest):
     owner, begin = np.repeat(np.arange(len(counts)), counts), np.repeat(offsets_from_counts(counts)[:-1], counts)
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
     back = along - along[begin]
-    some = np.flatnonzero((back >= LEAVING) & (back <= farthest))
+    some = np.flatnonzero((back >= LEAVING) & (back <= farthest) & (np.arange(len(back)) % EVERY == 0))
     below = head.closest_scalp(way[some]).position
     candidates = np.arange(1, min(CANDIDATES, tree.n) + 1)
-    near, knot = nearest_points(tree, below, candidates, FARTHEST)
+    near, knot = nearest_points(tree, below, candidates, max(FARTHEST, ASIDE * farthest))
     row, column = np.nonzero(np.isfinite(near))
     step, knot = some[row], knot[row, column].astype(np.int64)
     # a way high over the head or beside the scalp may be above a knot, or nearest to it, and yet far from it
     within = np.linalg.norm(tree.data[knot] - way[begin[step]], axis=1) <= farthest
     row, column, step, knot = row[within], column[within], step[within], knot[within]
-    cost = (near[row, column] / BESIDE) ** 2 + A_MILLIMETRE * back[step]
+    beside = near[row, column] / BESIDE
+    cost = np.where(beside < FAR, beside**2, FAR**2 + FAR_COST * (beside - FAR)) + A_MILLIMETRE * back[step]
     order = np.lexsort((cost, knot, owner[step]))
     order = order[np.unique(owner[step[order]] * tree.n + knot[order], return_index=True)[1]]
     return owner[step[order]], knot[order], cost[order], step[order]

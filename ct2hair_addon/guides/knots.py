@@ -90,11 +90,13 @@ def _chosen(roots, along, across, spread, knots, tree) -> np.ndarray:
     return chosen_knots(row[order], knot[order], cost[order], len(roots), len(knots))
 
 
-def chosen_knots(row: np.ndarray, knot: np.ndarray, cost: np.ndarray, roots: int, knots: int) -> np.ndarray:
-    """(roots,) the knot of each root, -1 for none, at the least sum of costs: LOOSE for a root without one.
+def chosen_knots(
+    row: np.ndarray, knot: np.ndarray, cost: np.ndarray, roots: int, knots: int, loose: float = LOOSE
+) -> np.ndarray:
+    """(roots,) the knot of each root, -1 for none, at the least sum of costs: `loose` for a root without one.
 
     row, knot, cost (J,): which of the `knots` each root may have, rows ascending, each pair once.
     """
     chosen = np.full(max(roots, knots), -1, np.int64)
-    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, {LOOSE: 0}, chosen)
+    assign(np.searchsorted(row, np.arange(len(chosen) + 1)), knot, cost, {loose: 0}, chosen)
     return chosen[:roots]
