@@ -165,3 +165,19 @@ def test_hair_that_passes_beside_the_scalp_makes_no_jump_to_its_edge(make_ball):
     assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() < 1.6
     assert np.linalg.norm(line[0] - knot[0]) < 6.0
     assert bald_below.signed_distance(line).min() > 0.4
+
+
+def test_where_hair_is_hidden_for_long_a_knot_may_lie_farther_beside_the_way(ball):
+    """Strands that make room for each other: of two whose ways pass one knot, one goes to the next, 8 mm aside."""
+    late = APART * 5.5
+    strands = Strands.from_polylines([*(lying(APART * n, 0.0, 70.0) for n in range(12)), lying(late, 40.0, 70.0)])
+    polar = 0.4 + 15.0 / RADIUS
+    aside = late + 8.0 / (RADIUS * np.sin(polar))
+    knot = np.array(ball.closest_scalp(place(aside, [15.0], 0.0)).position, float)
+    asked = strands, np.zeros(13, int), np.array([12]), knot, ball
+    assert not lead_to_free_knots(*asked, usual=40.0 / AS_FAR)[2][12]
+    led, roots, tied = lead_to_free_knots(*asked, usual=100.0 / AS_FAR)
+    assert tied[12]
+    np.testing.assert_allclose(roots[12], knot[0])
+    line = led.polylines()[12]
+    assert np.linalg.norm(line[0] - knot[0]) < 6.0 and np.linalg.norm(np.diff(line, axis=0), axis=1).max() < 1.6
