@@ -13,7 +13,7 @@ import numpy as np
 
 BID = 1e-3
 """By how much more a row bids than it must: no set of joints is cheaper than the one found by more than this for each row, in
-practice by a millionth (a tip left loose costs 16 and more)."""
+practice by a millionth (a tip left loose costs 14 and more)."""
 SHORT_LIST = 8
 """Columns that a row remembers as its cheapest: prices only rise, so while two of them stay below all the others were, those
 need not be looked at."""

@@ -25,7 +25,7 @@ LOOSE_ENDS = (20.0, 25.0, 30.0, 40.0, 60.0)
 may be more. Lower ones break good joints, higher ones make none but bad ones."""
 SPARE = 0.02
 """Share of strands more than are known that may be left: about as many prove to be nothing when they are rooted and fitted."""
-LOWEST, LACKING = 16.0, 0.01
+LOWEST, LACKING = 14.0, 0.01
 """The cost before those, and the share of strands that must be lacking even so: bad joints are then worse than broken ones."""
 
 
