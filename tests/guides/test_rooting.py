@@ -172,7 +172,7 @@ def test_rooted_strands_have_all_that_is_promised(ball):
     assert (np.linalg.norm(guides.tips, axis=1) > np.linalg.norm(guides.roots, axis=1)).all()
 
 
-@pytest.mark.parametrize(("counted", "known", "price"), [(True, 60, 16), (False, 0, 30)])
+@pytest.mark.parametrize(("counted", "known", "price"), [(True, 60, 14), (False, 0, 30)])
 def test_knots_say_how_many_strands_there_are_only_where_all_of_them_are_found(ball, counted, known, price):
     lines = [hair(a, 2, 40) for a in np.linspace(0, 6, 60)]
     knots = np.array([hair(a, 0, 1)[0] for a in np.linspace(0, 6, 60)])
