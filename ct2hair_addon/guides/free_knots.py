@@ -29,7 +29,7 @@ AS_FAR = 4.0
 """How far back knots are looked for, in the median of how far strands of the wig had to be followed: where hair stands up that
 is a few millimetres, and a strand without a knot is one too many."""
 CANDIDATES, EVERY = 32, 4
-"""Knots looked at beside each so manieth step."""
+"""Knots looked at beside a step, and of how many steps one is asked."""
 LEAVING = 4.0
 """mm behind its knot at which a strand is among the hair."""
 LOW = 0.8

@@ -248,10 +248,8 @@ def inside_one(boxes, child, first, count, corners, centre, dipole, radius, low,
     number."""
     if x < boxes[0, 0] or y < boxes[0, 1] or z < boxes[0, 2] or x > boxes[0, 3] or y > boxes[0, 4] or z > boxes[0, 5]:
         return False
-    i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
-    dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
-    node = sides[i, j, k]
-    if dx * dx + dy * dy + dz * dz < node * node:
+    node, off2 = _nearest_node(low, sides, x, y, z)
+    if off2 < node * node:
         return node < 0.0
     if slot >= 0 and walls[slot] and v > 0.0 and w > 0.0 and v + w < 1.0:
         return _behind(corners, slot, x, y, z)
@@ -264,9 +262,8 @@ def _signed_distance(
 ):
     for n in numba.prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
-        dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
-        off, node = np.sqrt(dx * dx + dy * dy + dz * dz), sides[i, j, k]
+        node, off2 = _nearest_node(low, sides, x, y, z)
+        off = np.sqrt(off2)
         if abs(node) - off > beyond:
             out[n] = node - off if node > 0.0 else node + off
             continue
@@ -284,9 +281,8 @@ def _signed_distance(
 def _outward(points, boxes, child, first, count, order, corners, centre, dipole, radius, low, sides, walls, out):
     for n in numba.prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
-        dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
-        known = abs(sides[i, j, k]) + np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-3
+        node, off2 = _nearest_node(low, sides, x, y, z)
+        known = abs(node) + np.sqrt(off2) + 1e-3
         d2, slot, v, w = nearest_one(boxes, child, first, count, corners, x, y, z, known * known)
         ax, ay, az = corners[slot, 0], corners[slot, 1], corners[slot, 2]
         ux, uy, uz = corners[slot, 3] - ax, corners[slot, 4] - ay, corners[slot, 5] - az
@@ -299,6 +295,14 @@ def _outward(points, boxes, child, first, count, order, corners, centre, dipole,
                 dx, dy, dz = -dx, -dy, -dz
         norm = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-30)
         out[n, 0], out[n, 1], out[n, 2] = dx / norm, dy / norm, dz / norm
+
+
+@numba.njit(cache=True, inline="always")
+def _nearest_node(low, sides, x, y, z):
+    """(signed distance of the grid node nearest to a point, squared distance of the point from it)."""
+    i, j, k = _node(x - low[0], sides.shape[0]), _node(y - low[1], sides.shape[1]), _node(z - low[2], sides.shape[2])
+    dx, dy, dz = x - low[0] - i * SIDES, y - low[1] - j * SIDES, z - low[2] - k * SIDES
+    return sides[i, j, k], dx * dx + dy * dy + dz * dz
 
 
 @numba.njit(cache=True, inline="always")

@@ -67,9 +67,9 @@ def refine(
     """Fit strands to the scan that they came from: roots stay where they are, curls are kept.
 
     strands: mm, scan frame, root first, rooted on the scalp. density: air subtracted, exactly 0 where nothing is known, as
-    where the net was cleared; hair_level: density above which a voxel is hair. head: answers `signed_distance(points)` in mm,
-    negative inside. profile: a lone strand's signature, measured on the strands where not given, or taken from `peak`, a lone
-    strand's by the thresholds, where none runs alone.
+    where the net was cleared; hair_level: density above which a voxel is hair. head: as `Boundary` wants it. profile: a lone
+    strand's signature, measured on the strands where not given, or taken from `peak`, a lone strand's by the thresholds, where
+    none runs alone.
     device: auto, cpu or cuda (see `device.py`). final: False where more is done to the strands: they are left as fitted,
     with a point every other voxel, and there are neither support nor scores. fewest: how many strands are known to be there:
     of traced ones none is taken for a double where no more are left. The same input and seed give the same bits on
