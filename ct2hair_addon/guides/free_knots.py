@@ -34,8 +34,8 @@ LEAVING = 4.0
 """mm behind its knot at which a strand is among the hair."""
 LOW = 0.8
 """mm over the scalp that it is at there."""
-CHUNK = 4096
-"""Strands whose ways are looked at together: some 800 MB where hair is hidden for 30 mm."""
+CHUNK = 1024
+"""Strands whose ways are looked at together: some 200 MB where hair is hidden for 30 mm."""
 
 
 def usually_followed(strands: Strands, made: np.ndarray) -> float:
@@ -86,7 +86,7 @@ def _passed(way, counts, tree, head, farthest):
     owner, begin = np.repeat(np.arange(len(counts)), counts), np.repeat(offsets_from_counts(counts)[:-1], counts)
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
     back = along - along[begin]
-    some = np.flatnonzero((back >= LEAVING) & (back <= farthest) & (np.arange(len(back)) % EVERY == 0))
+    some = np.flatnonzero((back >= LEAVING) & (back <= farthest) & ((np.arange(len(back)) - begin) % EVERY == 0))
     below = head.closest_scalp(way[some]).position
     candidates = np.arange(1, min(CANDIDATES, tree.n) + 1)
     near, knot = nearest_points(tree, below, candidates, max(FARTHEST, ASIDE * farthest))

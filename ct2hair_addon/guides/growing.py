@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from ..head import Head
 from ..progress import Progress, silent
 from ..settings import GuideSettings
-from ..strands import Strands, nearest_points, normalized, offsets_from_counts, point_tree, points_around
+from ..strands import Strands, concatenate, nearest_points, normalized, offsets_from_counts, point_tree, points_around
 from .direction import TOUCH, end_tangents
 
 REACHES = (1.0, 2.0, 4.0)
@@ -44,14 +44,13 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
     reached over what was grown before. Returns (strands with the grown points put before them, (N,) bool reached,
     (N,) float32 mm grown).
     """
-    count = len(strands)
     reached = np.asarray(rooted, bool).copy()
-    parts: list[np.ndarray | None] = [None] * count
-    grown = np.zeros(count, np.float32)
+    grown = np.zeros(len(strands), np.float32)
     forward, _ = end_tangents(strands)
     forest: list[tuple[cKDTree, Strands, np.ndarray]] = []
     fresh = np.flatnonzero(reached)
-    current = strands.select(fresh)
+    current = Strands(strands.points, strands.offsets).select(fresh)
+    done, bodies = [fresh], [current]
     for reach in REACHES:
         for _ in range(MOST_ROUNDS):
             waiting = np.flatnonzero(~reached)
@@ -64,37 +63,50 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
             source, place, found = _guides_for(
                 strands.roots[waiting], forward[waiting], forest, reach * settings.neighbour_radius
             )
-            chosen = np.flatnonzero(found)
-            if not len(chosen):
-                fresh = waiting[:0]
+            fresh = waiting[found]
+            if not len(fresh):
                 break
-            fresh = waiting[chosen]
-            bodies = []
-            for slot, n in zip(chosen, fresh, strict=True):
-                guide = forest[source[slot]][1]
-                strand = np.searchsorted(guide.offsets, place[slot], side="right") - 1
-                path = guide.points[guide.offsets[strand] : place[slot]]
-                parts[n] = _alongside(path, strands.points[strands.offsets[n]] - guide.points[place[slot]])
-                body = np.concatenate([parts[n], strands.points[strands.offsets[n] : strands.offsets[n + 1]]])
-                grown[n] = np.linalg.norm(np.diff(body[: len(path) + 1], axis=0), axis=1).sum()
-                bodies.append(body)
+            guides = [one for _, one, _ in forest]
+            current, grown[fresh] = _grown_beside(strands.select(fresh), guides, source[found], place[found])
             reached[fresh] = True
-            current = Strands.from_polylines(bodies)
-    put = [part for part in parts if part is not None]
-    counts = np.zeros(count, np.int64)
-    counts[[n for n, part in enumerate(parts) if part is not None]] = [len(part) for part in put]
-    before = np.concatenate(put) if put else np.zeros((0, 3), np.float32)
-    points = joined(before.astype(np.float32), offsets_from_counts(counts), strands.points, strands.offsets)
-    out = Strands(points, offsets_from_counts(counts + strands.counts))
+            done.append(fresh)
+            bodies.append(current)
+    rest = np.flatnonzero(~reached)
+    order = np.argsort(np.concatenate([*done, rest]))
+    out = concatenate([*bodies, Strands(strands.points, strands.offsets).select(rest)]).select(order)
     return out.with_attributes(**strands.strand_attributes), reached, grown
 
 
-def _alongside(path: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """A guide's `path` (M, 3), moved by `shift` (3,) mm where it ends, and by no more than CLOSE long before that."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    before = np.append(np.cumsum(steps[::-1])[::-1], 0.0)[-len(path) :]
-    close = min(CLOSE / max(float(np.linalg.norm(shift)), 1e-6), 1.0)
-    return path + (close + (1.0 - close) * np.exp(-before / MERGED))[:, None] * shift
+def _grown_beside(strands: Strands, guides: list[Strands], source: np.ndarray, place: np.ndarray) -> tuple[Strands, np.ndarray]:
+    """(the strands (N) with what their guides are before a point put before them, (N,) float32 mm of it): moved by how far they
+    are from there, and by no more than CLOSE long before.
+
+    source, place (N,): which of `guides` each grows along, and from which of its points.
+    """
+    first = np.zeros(len(strands), np.int64)
+    for number in np.unique(source):
+        some, offsets = source == number, guides[number].offsets
+        first[some] = offsets[np.searchsorted(offsets, place[some], side="right") - 1]
+    counts = place - first + 1
+    offsets = offsets_from_counts(counts)
+    owner = np.repeat(np.arange(len(strands)), counts)
+    row = (first - offsets[:-1])[owner] + np.arange(offsets[-1])
+    path = np.empty((offsets[-1], 3), np.float32)
+    for number in np.unique(source):
+        some = source[owner] == number
+        path[some] = guides[number].points[row[some]]
+    # the last point of each path is the one that its strand begins beside
+    last = offsets[1:] - 1
+    shift = strands.roots.astype(np.float64) - path[last]
+    along = Strands(path, offsets).arc_lengths()
+    before = (along[last][owner] - along)[:, None]
+    close = np.minimum(CLOSE / np.maximum(np.linalg.norm(shift, axis=1), 1e-6), 1.0)[owner, None]
+    path += (close + (1.0 - close) * np.exp(-before / MERGED)) * shift[owner]
+    keep = np.ones(len(path), bool)
+    keep[last] = False
+    points = joined(path[keep], offsets_from_counts(counts - 1), strands.points, strands.offsets)
+    out = Strands(points, offsets_from_counts(counts - 1 + strands.counts))
+    return out, out.arc_lengths()[out.offsets[:-1] + counts - 1]
 
 
 def _guides_for(ends, tangents, forest, reach):

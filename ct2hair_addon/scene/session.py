@@ -80,14 +80,14 @@ def import_scan(
     context: bpy.types.Context | None = None,
     progress: Progress = silent,
 ) -> ScanResult:
-    """Bring a scan into the scene as a Volume object in the collection 'CT2Hair <name>'.
+    """Bring a scan into the scene as a Volume object in the collection 'CT2Hair <name> import'.
 
     A .vdb is shown as it is (its units are read as mm). From any other format the wig alone (air and mannequin left out) is
     written to `folder`/scan.vdb first. The scan stands on the ground until a reconstruction knows where the head is.
     Raises ScanError for what can't be read or holds no hair; the scene is then untouched.
     """
     path, settings = Path(path), settings or Settings()
-    name, warnings, low = scan_name(path), (), None
+    name, warnings, low = f"{scan_name(path)} import", (), None
     if path.suffix.lower() == ".vdb":
         grid = path
     else:

@@ -192,7 +192,7 @@ def test_a_head_placed_by_hand_becomes_the_setting(job_folder):
     bpy.context.view_layer.update()
     assert attempt("use_place") == {"FINISHED"}
     matrix = placed_by_hand(bpy.context.scene.ct2hair.settings.head.place)
-    empty = bpy.data.objects["volume Scan"]
+    empty = bpy.data.objects["volume import Scan"]
     point = np.array([12.0, -30.0, 90.0, 1.0])  # mm in the head
     world = np.array(ob.matrix_world) @ [*(point[:3] / 1000), 1.0]
     np.testing.assert_allclose((np.array(empty.matrix_world) @ matrix @ point)[:3], world[:3], atol=1e-6)

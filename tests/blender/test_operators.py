@@ -139,7 +139,7 @@ def test_import_scan_shows_a_grid_and_remembers_it(job_folder):
     path = job_folder / "volume.vdb"
     assert bpy.ops.ct2hair.import_scan(filepath=str(path)) == {"FINISHED"}
     assert bpy.context.scene.ct2hair.scan == str(path)
-    assert bpy.data.objects["volume Volume"].type == "VOLUME"
+    assert bpy.data.objects["volume import Volume"].type == "VOLUME"
 
 
 def test_reconstruct_waits_without_a_window_and_loads_the_result(stand_in, job_folder):
@@ -153,7 +153,7 @@ def test_reconstruct_waits_without_a_window_and_loads_the_result(stand_in, job_f
     bpy.ops.ct2hair.import_scan(filepath=str(scan))
     assert bpy.ops.ct2hair.reconstruct(folder=str(job_folder)) == {"FINISHED"}
     assert len(bpy.data.objects["wig Hair"].data.curves) == 200
-    assert bpy.data.objects["volume Volume"].hide_get()  # the result brings its own
+    assert bpy.data.objects["volume import Volume"].hide_get()  # the result brings its own
 
 
 @pytest.mark.parametrize(

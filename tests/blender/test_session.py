@@ -1,6 +1,7 @@
 """The scripting API: scans and results arrive whole, where they belong, or not at all."""
 
 import json
+import shutil
 
 import bpy
 import numpy as np
@@ -104,13 +105,21 @@ def test_a_result_can_be_removed_whole(job_folder):
 
 def test_a_vdb_scan_is_shown_as_it_is(job_folder):
     shown = scene.import_scan(job_folder / "volume.vdb")
-    assert shown.collection.name == "CT2Hair volume"
+    assert shown.collection.name == "CT2Hair volume import"
     bpy.context.view_layer.update()
     matrix = shown.volume.matrix_world @ shown.volume.data.grids["density"].matrix_object
     low, high = matrix @ Vector((3, 5, 7)), matrix @ Vector((30, 20, 10))
     assert low.z == pytest.approx(0, abs=1e-7)  # on the ground, its middle over the origin
     np.testing.assert_allclose((low + high).xy, (0, 0), atol=1e-7)
     np.testing.assert_allclose(high - low, np.array([27, 15, 3]) * 0.0005, atol=1e-7)
+
+
+def test_a_result_is_named_after_its_scan_though_that_was_imported_before(job_folder, tmp_path):
+    scan = shutil.copy(job_folder / "volume.vdb", tmp_path / "wig.vdb")
+    imported = scene.import_scan(scan)
+    result = scene.load_result(job_folder)
+    assert (imported.collection.name, result.collection.name) == ("CT2Hair wig import", "CT2Hair wig")
+    assert (imported.volume.name, result.volume.name) == ("wig import Volume", "wig Volume")
 
 
 def test_an_unreadable_scan_leaves_the_scene_as_it_was(tmp_path):
