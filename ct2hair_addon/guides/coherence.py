@@ -5,6 +5,7 @@ The problem is an Ising spin glass's ground state: NP-hard, but these graphs are
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from scipy.sparse import csr_matrix
 
@@ -24,12 +25,25 @@ def settled(
     """
     value = start.astype(np.float64)
     for _ in range(ROUNDS):
-        heard = np.where(sure, start, np.tanh(GAIN * (graph @ value / np.maximum(scale, 1e-9) + hint)))
+        around = _summed(graph.indptr, graph.indices, graph.data, value)
+        heard = np.where(sure, start, np.tanh(GAIN * (around / np.maximum(scale, 1e-9) + hint)))
         change = np.abs(heard - value).max(initial=0.0)
         value = 0.5 * (value + heard)
         if change < 1e-3:
             break
     return value
+
+
+@numba.njit(cache=True, parallel=True)
+def _summed(starts, columns, bonds, value):
+    """The product of a graph with `value` (N,), on all threads, where scipy's runs on one."""
+    out = np.empty(len(value))
+    for n in numba.prange(len(value)):
+        total = 0.0
+        for k in range(starts[n], starts[n + 1]):
+            total += bonds[k] * value[columns[k]]
+        out[n] = total
+    return out
 
 
 def contracted(graph: csr_matrix, field: np.ndarray) -> np.ndarray:

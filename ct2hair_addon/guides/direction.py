@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
@@ -25,6 +26,8 @@ SCALP_HINT = 0.02
 PASSED, ROOTS_SEEN = 5.0, 0.5
 """mm over the scalp that strands pass on their way, and the share of those that do of which the roots must be seen to go by
 roots alone: 0.64 and more in loose hair, 0.14 to 0.21 in tied."""
+CHUNK = 65_536
+"""Points whose neighbours are asked at once: what bounds memory."""
 OPPOSED = 0.5
 """Share of its neighbours' votes against which a strand is no root's, whatever its end looks like."""
 
@@ -111,31 +114,34 @@ def _agreements(strands: Strands, reach: float, meeting) -> csr_matrix:
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
     tree = point_tree(samples.points)
-    rows, columns, weights = [], [], []
-    size = 65536
-    for start in range(0, len(samples.points), size):
-        part = slice(start, start + size)
-        distance, near = nearest_points(tree, samples.points[part], VOTERS + 1, reach)
-        found = np.isfinite(distance)
-        near = np.where(found, near, 0)
-        agreement = np.einsum("nkc,nc->nk", tangents[near], tangents[part])
-        weight = (
-            np.sign(agreement) * np.abs(agreement) ** 4 * np.exp(-0.5 * (np.where(found, distance, 0.0) / (0.5 * reach)) ** 2)
-        )
-        used = found & (index[near] != index[part][:, None])
-        rows.append(np.broadcast_to(index[part][:, None], near.shape)[used])
-        columns.append(index[near][used])
-        weights.append(weight[used])
+    parts = [np.zeros((0, 3))]
+    for start in range(0, len(samples.points), CHUNK):
+        distance, near = nearest_points(tree, samples.points[start : start + CHUNK], VOTERS + 1, reach)
+        votes = _votes(start, distance, near, index, tangents, 0.5 * reach)
+        row, column = np.nonzero(votes)
+        parts.append(np.stack([index[start + row], index[near[row, column]], votes[row, column]], axis=1))
+    row, column, votes = np.concatenate(parts).T
     count = len(strands)
-    graph = coo_matrix(
-        (
-            np.concatenate(weights or [[]]),
-            (np.concatenate(rows or [[]]).astype(int), np.concatenate(columns or [[]]).astype(int)),
-        ),
-        shape=(count, count),
-    ).tocsr()
+    graph = coo_matrix((votes, (row.astype(np.int64), column.astype(np.int64))), shape=(count, count)).tocsr()
     if meeting is not None:
         pairs, sign, cost = meeting
         weight = MEETING * sign * np.exp(-cost / MEETING_COST)
         graph = graph + coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
     return (graph + graph.T).tocsr()
+
+
+@numba.njit(cache=True, parallel=True)
+def _votes(start, distance, near, index, tangents, spread):
+    """(P, K) float64: by how much each point, from the `start`-th on, runs the way of those `near` it, `distance` mm off: above
+    0, or against it, below; 0 for those of its own strand and where there is none."""
+    out = np.zeros(near.shape)
+    for n in numba.prange(len(near)):
+        own = start + n
+        for k in range(near.shape[1]):
+            if not np.isfinite(distance[n, k]) or index[near[n, k]] == index[own]:
+                continue
+            agreement = 0.0
+            for axis in range(3):
+                agreement += tangents[own, axis] * tangents[near[n, k], axis]
+            out[n, k] = agreement * abs(agreement) ** 3 * np.exp(-0.5 * (distance[n, k] / spread) ** 2)
+    return out

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..progress import Progress, silent
 from ..settings import GuideSettings
+from ..strands import offsets_from_counts
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, add_strand
 from .sampling import centred, course_at, density_at, line_mean, plane
@@ -395,9 +396,8 @@ def trace_segments(
     shortest = max(int(settings.min_length / (settings.step * residual.spacing)), 6)
     turn = np.cos(np.radians(settings.max_turn))
     widths = np.array([4, 7, 11, 16, 24], np.int64)
-    pieces: list[np.ndarray] = []
+    pieces, sizes, reasons = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int64)], np.zeros(len(End), np.int64)
     tally = {"seeds": len(order), "seeds already taken": 0, "paths too short or already taken": 0}
-    tally |= dict.fromkeys(END_NAMES.values(), 0)
     paths = np.empty((BATCH, 2 * MOST_STEPS + 1, 3), np.float32)
     at, share = 0, 1.0
     progress(0, len(order))
@@ -425,12 +425,13 @@ def trace_segments(
             residual.table, residual.bricks, paths, firsts, counts, ends, profile.seen, profile.peak, profile.blur, shortest, 0,
             len(chosen),
         )  # fmt: skip
-        for n in np.flatnonzero(counts[:, 0] >= 0):
-            pieces.append(paths[n, firsts[n] : firsts[n] + counts[n].sum() + 1].copy())
-            tally[END_NAMES[End(ends[n, 0])]] += 1
-            tally[END_NAMES[End(ends[n, 1])]] += 1
-        tally["paths too short or already taken"] += int((counts[:, 0] < 0).sum())
-    sizes = np.array([len(piece) for piece in pieces], np.int64)
-    points = np.concatenate(pieces) if pieces else np.zeros((0, 3), np.float32)
-    tally["segments"] = len(pieces)
-    return Segments(points, np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), tally)
+        kept = np.flatnonzero(counts[:, 0] >= 0)
+        size = counts[kept].sum(axis=1) + 1
+        place = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size - firsts[kept], size)
+        pieces.append(paths[np.repeat(kept, size), place])
+        sizes.append(size)
+        reasons += np.bincount(ends[kept].ravel(), minlength=len(End))
+        tally["paths too short or already taken"] += len(chosen) - len(kept)
+    offsets = offsets_from_counts(np.concatenate(sizes))
+    tally |= {END_NAMES[End(reason)]: int(count) for reason, count in enumerate(reasons)} | {"segments": len(offsets) - 1}
+    return Segments(np.concatenate(pieces), offsets, tally)

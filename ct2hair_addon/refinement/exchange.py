@@ -90,16 +90,9 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
         progress(start, len(places))
         some = places[start : start + CHUNK]
         distance, near = nearest_points(tree, lines[some], NEAREST, REACH)
-        row, column = np.nonzero(np.isfinite(distance))
-        one, other = some[row], known[near[row, column]]
-        # of two that are asked alike, one side will do
-        apart = (owner[one] < owner[other]) | (~asked[other] & (owner[one] != owner[other]))
-        one, other, distance = one[apart], other[apart], distance[row, column][apart]
-        order = np.lexsort((distance, owner[other], one))
-        one, other = one[order], other[order]
-        nearest = np.ones(len(one), bool)
-        nearest[1:] = (one[1:] != one[:-1]) | (owner[other[1:]] != owner[other[:-1]])
-        pairs = np.stack([one[nearest], other[nearest]], axis=1)
+        other = _others(some, np.isfinite(distance), near, known, owner, asked)
+        row, column = np.nonzero(other >= 0)
+        pairs = np.stack([some[row], other[row, column]], axis=1)
         if start == 0:
             pairs = np.concatenate([left, pairs])
         gain = np.empty(len(pairs))
@@ -107,6 +100,28 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
         kept = gain >= LEAST_GAIN
         found.append((pairs[kept], gain[kept]))
     return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+
+@numba.njit(cache=True, parallel=True)
+def _others(places, found, near, known, owner, asked):
+    """(P, NEAREST) int64: of the points `near` each place, nearest first, the first of each other strand, -1 for the rest: of
+    two places that are asked alike, one side will do."""
+    out = np.full(near.shape, -1, np.int64)
+    for n in numba.prange(len(places)):
+        own = owner[places[n]]
+        for k in range(near.shape[1]):
+            if not found[n, k]:
+                break
+            other = known[near[n, k]]
+            strand = owner[other]
+            if strand == own or (strand < own and asked[other]):
+                continue
+            first = True
+            for before in range(k):
+                first &= out[n, before] < 0 or owner[out[n, before]] != strand
+            if first:
+                out[n, k] = other
+    return out
 
 
 @numba.njit(cache=True, parallel=True)

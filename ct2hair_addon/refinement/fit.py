@@ -131,9 +131,10 @@ def fit_to_volume(
             keep_lengths(points, offsets, made_up, rest_lengths, LENGTH_SWEEPS)
             boundary.push(points, offsets)
             if iteration == 0:
-                tally[f"misfit before, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))
+                whole = _scale(level.scan)
+                tally[f"misfit before, {size:.2f} mm (thousandths)"] = round(1000 * error / whole)
         if count:
-            tally[f"misfit after, {size:.2f} mm (thousandths)"] = round(1000 * error / _scale(level.scan))
+            tally[f"misfit after, {size:.2f} mm (thousandths)"] = round(1000 * error / whole)
         tally["iterations"] = tally.get("iterations", 0) + count
         del potential
     progress(1.0, 1.0)
