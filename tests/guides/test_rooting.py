@@ -47,6 +47,18 @@ def test_poor_segments_take_the_direction_of_their_neighbours(ball):
     assert (np.sign(value[12:]) == [-1 if n % 2 else 1 for n in range(11)]).all()
 
 
+def test_what_crosses_at_an_angle_has_no_say_against_what_runs_alongside(ball):
+    """In curls most of the nearest hair crosses: many hairs at 35 degrees, one after the other, and two alongside."""
+    along = np.arange(0.0, 40.1, 0.5)[:, None] * [0.0, 0.0, 1.0] + [0.0, 0.0, RADIUS + 20.0]
+    t = np.arange(-12.0, 12.1, 0.5)[:, None]
+    slope = np.radians(35.0)
+    across = t * [0.0, np.sin(slope), -np.cos(slope)] + [0.2, 0.0, RADIUS + 20.0]
+    crossing = [across + [0.0, 0.0, z] for z in np.arange(0.0, 40.0)]
+    strands = Strands.from_polylines([along, along + [1.5, 0.0, 0.0], along - [1.5, 0.0, 0.0], *crossing])
+    known = np.array([0, 1, 1, *[1] * len(crossing)], np.int8)
+    assert signs(strands, known, ball, GuideSettings(), True)[0] > 0.1
+
+
 def coiled(azimuth: float, lands: bool) -> np.ndarray:
     """A hair that lies on the ball from near its top on, rises off it, and ends high or comes down on the scalp steeply."""
     s = np.arange(0.0, 110.0, 0.5)
