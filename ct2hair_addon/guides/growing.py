@@ -49,7 +49,8 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
     forward, _ = end_tangents(strands)
     forest: list[tuple[cKDTree, Strands, np.ndarray]] = []
     fresh = np.flatnonzero(reached)
-    current = Strands(strands.points, strands.offsets).select(fresh)
+    bare = Strands(strands.points, strands.offsets)
+    current = bare.select(fresh)
     done, bodies = [fresh], [current]
     for reach in REACHES:
         for _ in range(MOST_ROUNDS):
@@ -67,13 +68,13 @@ def grow_to_root(strands: Strands, rooted: np.ndarray, settings: GuideSettings) 
             if not len(fresh):
                 break
             guides = [one for _, one, _ in forest]
-            current, grown[fresh] = _grown_beside(strands.select(fresh), guides, source[found], place[found])
+            current, grown[fresh] = _grown_beside(bare.select(fresh), guides, source[found], place[found])
             reached[fresh] = True
             done.append(fresh)
             bodies.append(current)
     rest = np.flatnonzero(~reached)
     order = np.argsort(np.concatenate([*done, rest]))
-    out = concatenate([*bodies, Strands(strands.points, strands.offsets).select(rest)]).select(order)
+    out = concatenate([*bodies, bare.select(rest)]).select(order)
     return out.with_attributes(**strands.strand_attributes), reached, grown
 
 
@@ -83,18 +84,13 @@ def _grown_beside(strands: Strands, guides: list[Strands], source: np.ndarray, p
 
     source, place (N,): which of `guides` each grows along, and from which of its points.
     """
-    first = np.zeros(len(strands), np.int64)
-    for number in np.unique(source):
-        some, offsets = source == number, guides[number].offsets
-        first[some] = offsets[np.searchsorted(offsets, place[some], side="right") - 1]
+    hair = concatenate(guides)
+    place = place + offsets_from_counts([len(one.points) for one in guides])[source]
+    first = hair.offsets[np.searchsorted(hair.offsets, place, side="right") - 1]
     counts = place - first + 1
     offsets = offsets_from_counts(counts)
     owner = np.repeat(np.arange(len(strands)), counts)
-    row = (first - offsets[:-1])[owner] + np.arange(offsets[-1])
-    path = np.empty((offsets[-1], 3), np.float32)
-    for number in np.unique(source):
-        some = source[owner] == number
-        path[some] = guides[number].points[row[some]]
+    path = hair.points[(first - offsets[:-1])[owner] + np.arange(offsets[-1])]
     # the last point of each path is the one that its strand begins beside
     last = offsets[1:] - 1
     shift = strands.roots.astype(np.float64) - path[last]
