@@ -117,15 +117,15 @@ def _agreements(strands: Strands, reach: float, meeting) -> csr_matrix:
     samples = strands.resampled_by_step(VOTE_STEP)
     index, tangents = samples.strand_index, samples.tangents().astype(np.float64)
     tree = point_tree(samples.points)
-    parts = [np.zeros((0, 3))]
+    parts = [(np.zeros(0), np.zeros(0, index.dtype), np.zeros(0, index.dtype))]
     for start in range(0, len(samples.points), CHUNK):
         distance, near = nearest_points(tree, samples.points[start : start + CHUNK], VOTERS + 1, reach)
-        votes = _votes(start, distance, near, index, tangents, reach)
-        row, column = np.nonzero(votes)
-        parts.append(np.stack([index[start + row], index[near[row, column]], votes[row, column]], axis=1))
-    row, column, votes = np.concatenate(parts).T
+        votes = _votes(start, distance, near, index, tangents, reach).ravel()
+        cast = np.flatnonzero(votes)
+        parts.append((votes[cast], index[start + cast // near.shape[1]], index[near.ravel()[cast]]))
+    votes, one, other = (np.concatenate(of) for of in zip(*parts, strict=True))
     count = len(strands)
-    graph = coo_matrix((votes, (row.astype(np.int64), column.astype(np.int64))), shape=(count, count)).tocsr()
+    graph = coo_matrix((votes, (one, other)), shape=(count, count)).tocsr()
     if meeting is not None:
         pairs, sign, cost = meeting
         weight = MEETING * sign * np.exp(-cost / MEETING_COST)

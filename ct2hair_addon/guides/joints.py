@@ -37,6 +37,8 @@ HELD = 96
 """Joints held of a tip, the cheapest: what they cost comes out within a ten-thousandth of what it does with all."""
 BLOCK = 20_000
 """Tips looked at at once: what bounds memory."""
+CELL = 16.0
+"""voxel; along an edge of the cells that tips are looked at by."""
 SPAN = 12.0
 """voxel; the length at an end that its course is fitted to."""
 PLACE = (2.0, 0.1)
@@ -97,7 +99,7 @@ def weighed_joints(
         for cut, points in zip(CUTS, left, strict=True):
             valid, *courses = _courses(lines, False, cut, voxel)
             for wanted, stations in ((onward >= 0, STATIONS[:NEAR_STATIONS]), (onward < 0, STATIONS)):
-                tips = np.flatnonzero(valid & wanted)
+                tips = _side_by_side(np.flatnonzero(valid & wanted), courses[0])
                 for some in np.array_split(tips, max(-(-len(tips) // BLOCK), 1)):
                     ends = found[_ahead(tree, some, courses, stations, 2 * NEAREST)]
                     _hold(
@@ -125,9 +127,10 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
     both = zip(*(_courses(lines, first, 0.0, voxel) for first in (True, False)), strict=True)
     valid, *courses = (np.concatenate(ends) for ends in both)
     usable = np.flatnonzero(valid)
-    near = _ahead(cKDTree(courses[0][usable]), usable, courses, STATIONS[:NEAR_STATIONS], NEAREST)
+    tips = _side_by_side(usable, courses[0])
+    near = _ahead(cKDTree(courses[0][usable]), tips, courses, STATIONS[:NEAR_STATIONS], NEAREST)
     row, column = np.nonzero(near < len(usable))
-    one, other = usable[row], usable[near[row, column]]
+    one, other = tips[row], usable[near[row, column]]
     pair = np.unique(np.minimum(one, other) * (2 * count) + np.maximum(one, other))
     one, other = pair // (2 * count), pair % (2 * count)
     # an end of one piece at the beginning of the next is weighed as a cut
@@ -202,6 +205,15 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
         norm = np.sqrt(tangent[n, 0] ** 2 + tangent[n, 1] ** 2 + tangent[n, 2] ** 2)
         for axis in range(3):
             tangent[n, axis] /= max(norm, 1e-9)
+
+
+def _side_by_side(ends: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The ends, by their places (., 3) in voxels, cell by cell: those that follow each other have the same ends around them."""
+    if not len(ends):
+        return ends
+    cell = (place[ends] / CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    return ends[np.argsort(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)), kind="stable")]
 
 
 def _ahead(

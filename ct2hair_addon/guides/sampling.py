@@ -1,4 +1,4 @@
-"""Trilinear reads of the density inside kernels, with a fast path for points whose eight voxels share a brick."""
+"""Reads of the density and of the hair's course inside kernels."""
 
 from __future__ import annotations
 
@@ -10,29 +10,8 @@ from ..volume.grid import UNIT, trilinear
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def density_at(table, bricks, x, y, z):
-    """The trilinear density at continuous voxel indices, 0 off the bricks: `volume.grid.trilinear`, several times faster."""
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    a, b, c = i & 15, j & 15, k & 15
-    I, J, K = i >> 4, j >> 4, k >> 4
-    if a < 15 and b < 15 and c < 15 and 0 <= I < table.shape[0] and 0 <= J < table.shape[1] and 0 <= K < table.shape[2]:
-        row = table[I, J, K]
-        value = 0.0
-        if row >= 0:
-            low = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
-            a += 1
-            high = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
-            value = _amid(low, high, x - i, y - j, z - k)
-    else:
-        value = trilinear(table, bricks, np.float32(0.0), x, y, z)
-    return value
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _amid(low, high, u, v, w):
-    """The trilinear value amid eight voxels: four at the lower x, along z and then y, four at the higher."""
-    near = (low[0] * (1.0 - w) + low[1] * w) * (1.0 - v) + (low[2] * (1.0 - w) + low[3] * w) * v
-    far = (high[0] * (1.0 - w) + high[1] * w) * (1.0 - v) + (high[2] * (1.0 - w) + high[3] * w) * v
-    return near * (1.0 - u) + far * u
+    """The trilinear density at continuous voxel indices, 0 off the bricks."""
+    return trilinear(table, bricks, np.float32(0.0), x, y, z)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ from ..volume import BrickVolume
 from ..volume.grid import trilinear, voxel
 from ..volume.strand_signal import INTERPOLATION_VARIANCE, StrandProfile, add_strand
 from .blur import CHUNK, blurred
-from .curves import segment_samples, spline, spline_at
+from .curves import SAMPLES_PER_VOXEL, segment_samples, spline, spline_at
 from .splat import render
 
 LEAST_EARNED = 8.0
@@ -34,6 +34,8 @@ BARE_COST = 1.0
 """What a stretch where the scan shows no hair costs beside its misfit: amid dense hair any strand earns something."""
 REMOVED = "strands removed: the scan has them already"
 CUT_BACK = "tips cut back"
+BLOBS = 1.7
+"""Points within a blur that a strand taken out is made of: the tube itself to a thousandth."""
 RING = 1.0
 """voxel; the misfit is read on the centre line and on four points this far from it."""
 
@@ -230,7 +232,7 @@ def take_out(table, excess, points, visible, start, end, low, high, peak, blur):
     rendering: what is cut no longer shows."""
     samples = 0
     for m in range(low, high):
-        samples += segment_samples(points, m)
+        samples += _blobs(points, m, blur)
     path = np.empty((samples + 1, 3), np.float32)
     amplitude = np.empty(samples + 1)
     for axis in range(3):
@@ -238,10 +240,16 @@ def take_out(table, excess, points, visible, start, end, low, high, peak, blur):
     amplitude[0] = -peak * visible[low]
     at = 1
     for m in range(low, high):
-        curve, count = spline(points, m, m == start, m + 2 >= end), segment_samples(points, m)
+        curve, count = spline(points, m, m == start, m + 2 >= end), _blobs(points, m, blur)
         for s in range(count):
             t = (s + 1.0) / count
             path[at, 0], path[at, 1], path[at, 2] = spline_at(curve, t)
             amplitude[at] = -peak * ((1.0 - t) * visible[m] + t * visible[m + 1])
             at += 1
     add_strand(table, excess, path, amplitude, blur)
+
+
+@numba.njit(cache=True, inline="always")
+def _blobs(points, m, blur):
+    """How many blobs, BLOBS within a blur, make up the profile of the segment from control point m to m + 1."""
+    return max(1, int(np.ceil(segment_samples(points, m) * BLOBS / (SAMPLES_PER_VOXEL * blur))))

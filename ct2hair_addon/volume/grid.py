@@ -114,9 +114,37 @@ def voxel(table, bricks, background, i, j, k):
     return bricks[row, i & 15, j & 15, k & 15]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def trilinear(table, bricks, background, x, y, z):
-    """The trilinear value at continuous voxel indices. For kernels."""
+    """The trilinear value at continuous voxel indices. For kernels: several times faster where all eight voxels lie in one
+    brick, as they do around most points."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = i & 15, j & 15, k & 15
+    I, J, K = i >> 4, j >> 4, k >> 4
+    if a < 15 and b < 15 and c < 15 and 0 <= I < table.shape[0] and 0 <= J < table.shape[1] and 0 <= K < table.shape[2]:
+        row = table[I, J, K]
+        value = float(background)
+        if row >= 0:
+            low = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
+            a += 1
+            high = bricks[row, a, b, c], bricks[row, a, b, c + 1], bricks[row, a, b + 1, c], bricks[row, a, b + 1, c + 1]
+            value = _amid(low, high, x - i, y - j, z - k)
+    else:
+        value = _across(table, bricks, background, x, y, z)
+    return value
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _amid(low, high, u, v, w):
+    """The trilinear value amid eight voxels: four at the lower x, along z and then y, four at the higher."""
+    near = (low[0] * (1.0 - w) + low[1] * w) * (1.0 - v) + (low[2] * (1.0 - w) + low[3] * w) * v
+    far = (high[0] * (1.0 - w) + high[1] * w) * (1.0 - v) + (high[2] * (1.0 - w) + high[3] * w) * v
+    return near * (1.0 - u) + far * u
+
+
+@numba.njit(cache=True, nogil=True)
+def _across(table, bricks, background, x, y, z):
+    """`trilinear` where the eight voxels lie in more than one brick, or in none."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
     total = 0.0

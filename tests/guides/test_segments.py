@@ -9,7 +9,7 @@ import pytest
 
 from ct2hair_addon.errors import Cancelled
 from ct2hair_addon.guides import find_segments, stage, trace_guides
-from ct2hair_addon.guides.sampling import centred, course_at, density_at
+from ct2hair_addon.guides.sampling import centred, course_at
 from ct2hair_addon.guides.seeds import seed_voxels
 from ct2hair_addon.guides.trace import add_strand, smoothed
 from ct2hair_addon.orientation import orientation_field
@@ -152,14 +152,6 @@ def test_traces_in_a_bundle_keep_to_the_course_of_the_hair():
         return np.degrees(np.mean(np.arccos(np.abs(steps[:, 0]) / np.linalg.norm(steps, axis=1))))
 
     assert off_course(False) < 0.6 * off_course(True)
-
-
-def test_density_is_trilinear_across_bricks():
-    volume = scan([straight((8, 8, 8), (40, 30, 44))], (48, 48, 48))
-    points = np.random.default_rng(0).uniform(1, 46, (500, 3))
-    found = [density_at(volume.table, volume.bricks, *p) for p in points]
-    np.testing.assert_allclose(found, volume.sample(volume.to_scan(points)), atol=1e-3)
-    assert density_at(volume.table, volume.bricks, -1.0, 5.0, 5.0) == 0.0
 
 
 def test_centring_moves_onto_the_line():

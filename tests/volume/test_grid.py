@@ -1,6 +1,8 @@
 """BrickVolume: the frame, blocks and samples against the dense array that they come from."""
 
 import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
 
 from ct2hair_addon.volume import BrickVolume
 
@@ -29,6 +31,18 @@ def test_voxel_centres_follow_the_convention_of_openvdb_and_itk():
     np.testing.assert_allclose(volume.to_scan([[3, 4, 50]]), centre)
     np.testing.assert_allclose(volume.sample(centre), [7.0], atol=1e-5)
     np.testing.assert_allclose(volume.sample(centre + [[0.1, 0.0, 0.0]]), [7.0 * 0.75], atol=1e-5)
+
+
+@pytest.mark.parametrize("background", [0.0, -3.0])
+def test_samples_are_trilinear_within_a_brick_and_across_bricks_and_their_ends(background):
+    random = np.random.default_rng(0)
+    array = random.normal(0.0, 1.0, (48, 32, 48)).astype(np.float32)
+    array[16:32, :16, 16:32] = background  # a brick that is not stored
+    volume = BrickVolume.from_dense(array, 0.4, background=background)
+    assert len(volume.bricks) == 17
+    places = random.uniform(-20.0, 70.0, (20_000, 3))
+    expected = map_coordinates(np.pad(array, 40, constant_values=background), (places + 40).T, order=1)
+    np.testing.assert_allclose(volume.sample(volume.to_scan(places)), expected, atol=1e-5)
 
 
 def test_brick_index_names_the_brick_of_each_row():
