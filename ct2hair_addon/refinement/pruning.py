@@ -35,7 +35,7 @@ BARE_COST = 1.0
 REMOVED = "strands removed: the scan has them already"
 CUT_BACK = "tips cut back"
 BLOBS = 1.7
-"""Points within a blur that a strand taken out is made of: the tube itself to a thousandth."""
+"""Points within a blur that a strand taken out is made of: the tube to a thousandth, its ends to a hundredth."""
 RING = 1.0
 """voxel; the misfit is read on the centre line and on four points this far from it."""
 
