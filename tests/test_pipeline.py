@@ -214,7 +214,7 @@ def test_an_interrupted_run_goes_on_after_the_last_amendment(scan, tmp_path, mon
     assert pipeline.reconstruct(scan, tmp_path / "whole", settings, until="guides") is None
 
     def cut_off_at_the_second(*args, **kwargs):
-        calls.append(len(args[0]))
+        calls.append(args[0].points.tobytes())  # of two amendments the pieces may be as many
         if len(calls) == 2:
             raise Cancelled
         return amending(*args, **kwargs)

@@ -3,7 +3,8 @@
 Where hairs touch, a trace may go on along the other one. Whichever way it went, the scan is explained alike, so no fit to it
 brings the strand back; and in a bundle one that is in its neighbour's place keeps others from theirs. But hair goes on as it
 came. So wherever two strands meet, both are weighed as they are and with their tips exchanged, by how smooth a curve goes
-through what lies to both sides of the place.
+through what lies to both sides of the place. Nor does hair end because another comes by: a strand that ends beside one that
+would go on better from it takes that one's tip over, and has its own end there instead.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ BLOCK = 64
 def exchange_tips(
     points: np.ndarray, offsets: np.ndarray, voxel: float, may: np.ndarray, most: int, progress: Progress = silent
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Control points (M, 3) mm and offsets (N + 1,) of the strands with tips exchanged, and how many exchanges were made.
+    """Control points (M, 3) mm and offsets (N + 1,) of the strands with tips exchanged, and how often one or two changed hands.
 
     voxel: mm. may: (N,) bool, strands that take part. most: control points of a strand at most. Roots and their order stay.
     The same on any number of threads.
@@ -55,7 +56,7 @@ def exchange_tips(
     places = np.flatnonzero(np.repeat(may, np.diff(starts)))
     known = places[::KNOWN_EVERY]
     tree = point_tree(lines[known])
-    places = places[::ASKED_EVERY]
+    places = _some(places, following)
     asked, left = np.ones(len(lines), bool), np.zeros((0, 2), np.int64)
     made = 0
     for number in range(ROUNDS):
@@ -68,7 +69,7 @@ def exchange_tips(
         asked = np.zeros(len(lines), bool)
         done, waits = _exchange(lines, following, previous, owner, pairs[order], asked)
         made += done
-        places, left = np.flatnonzero(asked)[::ASKED_EVERY], pairs[order][waits]
+        places, left = _some(np.flatnonzero(asked), following), pairs[order][waits]
     chained, chained_starts = _chains(lines, following, starts)
     progress(1.0, 1.0)
     return *control_points(Strands((chained * voxel).astype(np.float32), chained_starts), most), made
@@ -82,6 +83,13 @@ def _linked(count: int, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return following, previous, np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
 
 
+def _some(places: np.ndarray, following: np.ndarray) -> np.ndarray:
+    """Every ASKED_EVERY-th of `places`, and the tips among them."""
+    chosen = following[places] < 0
+    chosen[::ASKED_EVERY] = True
+    return places[chosen]
+
+
 def _worth_it(lines, following, previous, owner, tree, known, places, asked, left, progress) -> tuple[np.ndarray, np.ndarray]:
     """(pairs (J, 2) of points whose strands are better with tips exchanged there, gain (J,)): of `left` and at `places`, some
     of the points that are `asked` (K,) bool."""
@@ -90,7 +98,7 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
         progress(start, len(places))
         some = places[start : start + CHUNK]
         distance, near = nearest_points(tree, lines[some], NEAREST, REACH)
-        other = _others(some, np.isfinite(distance), near, known, owner, asked)
+        other = _others(some, np.isfinite(distance), near, known, owner, asked, following)
         row, column = np.nonzero(other >= 0)
         pairs = np.stack([some[row], other[row, column]], axis=1)
         if start == 0:
@@ -103,18 +111,18 @@ def _worth_it(lines, following, previous, owner, tree, known, places, asked, lef
 
 
 @numba.njit(cache=True, parallel=True)
-def _others(places, found, near, known, owner, asked):
+def _others(places, found, near, known, owner, asked, following):
     """(P, NEAREST) int64: of the points `near` each place, nearest first, the first of each other strand, -1 for the rest: of
-    two places that are asked alike, one side will do."""
+    two places that are asked alike, one side will do, but of a tip and a place that one is asked."""
     out = np.full(near.shape, -1, np.int64)
     for n in numba.prange(len(places)):
-        own = owner[places[n]]
+        own, tip = owner[places[n]], following[places[n]] < 0
         for k in range(near.shape[1]):
             if not found[n, k]:
                 break
             other = known[near[n, k]]
             strand = owner[other]
-            if strand == own or (strand < own and asked[other]):
+            if strand == own or (strand < own and asked[other] and not tip):
                 continue
             first = True
             for before in range(k):
@@ -127,7 +135,8 @@ def _others(places, found, near, known, owner, asked):
 @numba.njit(cache=True, parallel=True)
 def _weigh(lines, following, previous, pairs, gain):
     """How much better two strands are with tips exchanged at each of `pairs`, whose second is moved to where it is nearest to
-    the first; -1 where they can't be, and anything below LEAST_GAIN where that is not worth it."""
+    the first; -1 where they can't be, and anything below LEAST_GAIN where that is not worth it. Where the first is a tip, one
+    curve is weighed against the other: the second strand as it goes on, and the first going on as that."""
     for block in numba.prange(-(-len(pairs) // BLOCK)):
         walks, seen = np.empty((4, WINDOW), np.int64), np.empty((4, WINDOW, 2))
         factor, known = np.empty((2 * WINDOW - 1, BAND + 1)), (0, 0, 0.0)
@@ -138,23 +147,29 @@ def _weigh(lines, following, previous, pairs, gain):
             gain[n] = -1.0
             heads = _walk(one, previous, walks[0]), _walk(other, previous, walks[1])
             tails = _walk(one, following, walks[2]), _walk(other, following, walks[3])
-            if min(heads[0], heads[1], tails[0], tails[1]) < HIDDEN + LEAST_SIDE:
+            ends = following[one] < 0
+            shortest = min(heads[0], heads[1], tails[1])
+            if ends:
+                walks[2, 1] = one  # at its tip a strand goes the way of its last two points
+            else:
+                shortest = min(shortest, tails[0])
+            if shortest < HIDDEN + LEAST_SIDE:
                 continue
             if not _across(lines, walks, (heads[0], heads[1], tails[0], tails[1]), seen):
                 continue
-            stiff = min(
-                _stiffness(lines, walks[0], walks[2], min(heads[0], tails[0]) - 1),
-                _stiffness(lines, walks[1], walks[3], min(heads[1], tails[1]) - 1),
-            )
-            known = _factor(heads[0], tails[0], stiff, factor, known)
-            worth = _roughness(seen[0], heads[0], seen[2], tails[0], factor)
+            stiff = _stiffness(lines, walks[1], walks[3], min(heads[1], tails[1]) - 1)
+            if not ends:
+                stiff = min(stiff, _stiffness(lines, walks[0], walks[2], min(heads[0], tails[0]) - 1))
             known = _factor(heads[1], tails[1], stiff, factor, known)
-            worth += _roughness(seen[1], heads[1], seen[3], tails[1], factor)
+            worth = _roughness(seen[1], heads[1], seen[3], tails[1], factor)
+            if not ends:
+                known = _factor(heads[0], tails[0], stiff, factor, known)
+                worth += _roughness(seen[0], heads[0], seen[2], tails[0], factor)
             # the roughness of what would be is not below 0: most places need no second look
             if worth >= LEAST_GAIN:
                 known = _factor(heads[0], tails[1], stiff, factor, known)
                 worth -= _roughness(seen[0], heads[0], seen[3], tails[1], factor)
-            if worth >= LEAST_GAIN:
+            if worth >= LEAST_GAIN and not ends:
                 known = _factor(heads[1], tails[0], stiff, factor, known)
                 worth -= _roughness(seen[1], heads[1], seen[2], tails[0], factor)
             gain[n] = worth
@@ -283,7 +298,7 @@ def _roughness(head, heads, tail, tails, factor):
 @numba.njit(cache=True)
 def _exchange(lines, following, previous, owner, pairs, touched):
     """Exchange the tips of strands at `pairs`, best first, where nothing was `touched` (K,) bool yet: (how many, (J,) bool:
-    those that were, to be weighed anew). The points of both by the place are laid on the curve that now goes through."""
+    those that were, to be weighed anew). The points of each that goes on by the place are laid on the curve through it."""
     done, waits, walks = 0, np.zeros(len(pairs), np.bool_), np.empty((2, WINDOW), np.int64)
     for n in range(len(pairs)):
         one, other = pairs[n]
@@ -295,7 +310,9 @@ def _exchange(lines, following, previous, owner, pairs, touched):
         done += 1
         ahead, beyond = following[one], following[other]
         following[one], following[other] = beyond, ahead
-        previous[beyond], previous[ahead] = one, other
+        previous[beyond] = one
+        if ahead >= 0:
+            previous[ahead] = other
         first, second = owner[one], owner[other]
         while ahead >= 0:
             owner[ahead] = second
@@ -306,9 +323,10 @@ def _exchange(lines, following, previous, owner, pairs, touched):
         for place in (one, other):
             head = walks[0][: _walk(place, previous, walks[0])]
             tail = walks[1][: _walk(following[place], following, walks[1])]
-            _mend(lines, head, tail)
             touched[head] = True
-            touched[tail] = True
+            if len(tail):
+                _mend(lines, head, tail)
+                touched[tail] = True
     return done, waits
 
 

@@ -1,4 +1,4 @@
-"""Tips exchanged where strands went over to each other's course."""
+"""Tips exchanged, or taken over, where strands went over to each other's course."""
 
 from __future__ import annotations
 
@@ -72,12 +72,40 @@ def test_one_that_hops_through_three_lanes_comes_back_to_its_own():
         assert np.abs(moved[ends[n] : ends[n + 1], 1] - lane).max() < 0.15
 
 
+def came_over(slope: float = 0.4) -> np.ndarray:
+    """From a lane aside onto y = 0 at 20 mm, and on along it."""
+    return np.stack([ALONG, slope * 0.5 * (20.0 - ALONG + np.hypot(ALONG - 20.0, 1.5)), np.zeros_like(ALONG)], axis=1)
+
+
+def test_one_that_ends_where_another_comes_over_into_its_lane_takes_that_ones_tip_over():
+    whole, ended = straight(0.0), straight(0.0)[:11]
+    for order in (1, -1):
+        points, offsets = strands(*(ended, came_over())[::order])
+        moved, ends, made = exchanged(points, offsets)
+        assert made == 1
+        mine, others = (moved[ends[n] : ends[n + 1]] for n in (0, 1)[::order])
+        np.testing.assert_allclose(mine[[0, -1]], whole[[0, -1]], atol=0.05)
+        assert np.abs(mine[:, 1]).max() < 0.1
+        assert others[-1, 0] == pytest.approx(20.0, abs=0.5)
+        np.testing.assert_allclose(others[0], came_over()[0], atol=1e-4)
+
+
+def test_one_that_ends_beside_others_that_go_on_as_they_came_keeps_its_end():
+    ended = straight(0.05)[:11]
+    for other in (straight(0.0, 0.3), straight(-0.1, 0.2), came_over() + [0.0, 0.0, 1.2]):
+        points, offsets = strands(ended, other)
+        moved, ends, made = exchanged(points, offsets)
+        assert made == 0
+        np.testing.assert_allclose(moved[ends[1:] - 1], points[offsets[1:] - 1], atol=1e-3)
+
+
 def test_strands_that_may_not_and_those_of_other_ways_keep_their_tips():
     points, offsets = bounced()
     for may in ([False, False], [True, False]):
         moved, _, made = exchanged(points, offsets, may)
         assert made == 0
         np.testing.assert_allclose(moved, points, atol=0.02)
+    assert exchanged(*strands(straight(0.0)[:11], came_over()), [True, False])[2] == 0
     back = strands(points[offsets[0] : offsets[1]], points[offsets[1] : offsets[2]][::-1])
     assert exchanged(*back)[2] == 0
 
