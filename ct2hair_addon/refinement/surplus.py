@@ -18,7 +18,11 @@ from .curves import EVEN, control_points, even_lines
 from .pruning import earnings, excess_of, prefix, take_out
 
 REACH = 2.0
-"""voxel that strands may be off by: the misfit is summed over as much."""
+"""voxel that strands may be off by: the misfit is summed over as much.
+
+The blur is cut off at 3 voxels, which leaves one of 1.6, under which a strand too many reads 1.2 of itself: what is asked of
+stretches here, and of doubles before a fit (`pruning`), holds for that.
+"""
 LEAST_SURPLUS = 4.0
 """voxel; a stretch is cut out where so much of a lone strand's length is won by it."""
 MOST_CUTS = 8
