@@ -151,8 +151,8 @@ def meeting_ends(pieces: Pieces, density: BrickVolume, strand: float) -> tuple[n
 def _courses(lines: Strands, from_root: bool, cut: float, voxel: float):
     """(valid (N,), place, tangent, bend (N, 3)): the course of each strand as it leaves its end, in voxels.
 
-    A parabola is fitted to SPAN voxels before the end (for root ends: after it); tangent and bend (second derivative) are
-    those along the outward direction.
+    A parabola is fitted to SPAN voxels before the end (for root ends: after it), and goes on to the end from its middle as the
+    circle that bends as it does there; tangent and bend (second derivative) are those along the outward direction.
     """
     counts = lines.counts
     skip = round(cut / STEP)
@@ -201,10 +201,34 @@ def _fit_ends(points, offsets, index, way, window, step, valid, place, tangent, 
                 a = points[index[n], axis]
                 b = (points[index[n] + way * (size - 1), axis] - a) / max((size - 1) * step, 1e-9)
                 c = 0.0
-            place[n, axis], tangent[n, axis], bend[n, axis] = a, -b, 2.0 * c
-        norm = np.sqrt(tangent[n, 0] ** 2 + tangent[n, 1] ** 2 + tangent[n, 2] ** 2)
+            middle = 0.5 * (size - 1) * step
+            place[n, axis], tangent[n, axis], bend[n, axis] = a + (b + c * middle) * middle, -b - 2.0 * c * middle, 2.0 * c
+        speed = along = 0.0
         for axis in range(3):
-            tangent[n, axis] /= max(norm, 1e-9)
+            speed += tangent[n, axis] ** 2
+            along += tangent[n, axis] * bend[n, axis]
+        speed, square = max(np.sqrt(speed), 1e-9), 0.0
+        for axis in range(3):
+            tangent[n, axis] /= speed
+            bend[n, axis] = (bend[n, axis] - along / speed * tangent[n, axis]) / speed
+            square += bend[n, axis] ** 2
+        far, aside, cosine = arc(np.sqrt(square), 0.5 * (size - 1) * step)
+        for axis in range(3):
+            t, b = tangent[n, axis], bend[n, axis]
+            place[n, axis] += far * t + aside * b
+            tangent[n, axis] = cosine * t + far * b
+            bend[n, axis] = cosine * b - far * square * t
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def arc(curvature, length):
+    """(far, aside, cosine) of a circle after `length`: it lies far ahead along its tangent there and aside by so much of its
+    bend, and goes on along cosine times the one and far times the other."""
+    angle = curvature * length
+    if angle < 0.02:
+        return length, 0.5 * length * length, 1.0 - 0.5 * angle * angle
+    cosine = np.cos(angle)
+    return np.sin(angle) / curvature, (1.0 - cosine) / curvature**2, cosine
 
 
 def _side_by_side(ends: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -225,10 +249,14 @@ def _ahead(
 ) -> np.ndarray:
     """(T, K) int64: what of the tree lies around the stations ahead of each of the tips; its size where that is not so much."""
     near, (place, out, bend) = [], courses
+    curvature = np.linalg.norm(bend[tips], axis=1)
     for ahead, radius in stations:
-        for bent in (0.5,) if ahead < STRAIGHT else (0.5, 0.0):
-            centre = place[tips] + ahead * out[tips] + bent * ahead**2 * bend[tips]
-            near.append(nearest_points(tree, centre, nearest, radius)[1])
+        turn = np.maximum(curvature * ahead, 1e-6)[:, None]
+        far, aside = np.sin(turn) / turn, 2.0 * (np.sin(0.5 * turn) / turn) ** 2
+        centres = [place[tips] + ahead * far * out[tips] + ahead**2 * aside * bend[tips]]
+        if ahead >= STRAIGHT:
+            centres.append(place[tips] + ahead * out[tips])
+        near.extend(nearest_points(tree, centre, nearest, radius)[1] for centre in centres)
     return np.concatenate(near, axis=1)
 
 
@@ -312,43 +340,45 @@ def _joint(a, b, place, out, bend, root_place, root_out, root_bend, table, brick
     gap = np.sqrt(gap)
     if forward < -1.0 or forward < 0.5 * gap - 1.5:
         return 1e9
-    jump = 0.0
+    if PER_VOXEL * gap > most:
+        return PER_VOXEL * gap
+    half = 0.5 * max(forward, 0.0)
+    square = root_square = 0.0
     for axis in range(3):
-        jump += (bend[a, axis] - root_bend[b, axis]) ** 2
+        square += bend[a, axis] ** 2
+        root_square += root_bend[b, axis] ** 2
+    far, aside, cosine = arc(np.sqrt(square), half)
+    root_far, root_aside, root_cosine = arc(np.sqrt(root_square), half)
+    jump = miss = straight = dot = straight_dot = 0.0
+    for axis in range(3):
+        ta, ba, tb, bb = out[a, axis], bend[a, axis], root_out[b, axis], root_bend[b, axis]
+        apart = place[a, axis] - root_place[b, axis]
+        jump += (cosine * ba - far * square * ta - root_cosine * bb + root_far * root_square * tb) ** 2
+        miss += (apart + far * ta + aside * ba - root_far * tb - root_aside * bb) ** 2
+        dot -= (cosine * ta + far * ba) * (root_cosine * tb + root_far * bb)
+        straight += (apart + half * (ta - tb)) ** 2
+        straight_dot -= ta * tb
     apart = jump / (BEND[0] + BEND[1] * gap) ** 2 + PER_VOXEL * gap
     if apart > most:
         return apart
-    half = 0.5 * max(forward, 0.0)
-    best = 1e9
-    for curved in range(2):
-        miss = 0.0
-        norm_a = norm_b = dot = 0.0
-        for axis in range(3):
-            pa, ta = place[a, axis] + half * out[a, axis], out[a, axis]
-            pb, tb = root_place[b, axis] + half * root_out[b, axis], root_out[b, axis]
-            if curved:
-                pa += 0.5 * half * half * bend[a, axis]
-                pb += 0.5 * half * half * root_bend[b, axis]
-                ta += half * bend[a, axis]
-                tb += half * root_bend[b, axis]
-            miss += (pa - pb) ** 2
-            norm_a += ta * ta
-            norm_b += tb * tb
-            dot -= ta * tb
-        value = miss / (PLACE[0] + PLACE[1] * gap) ** 2
+    # hair goes on bending as it did, or straight on
+    best, place_off, turn_off = 1e9, (PLACE[0] + PLACE[1] * gap) ** 2, TURN[0] + TURN[1] * gap
+    for off, along in ((miss, dot), (straight, straight_dot)):
+        value = off / place_off
         if value < best and value + apart <= most:
-            turn = np.arccos(min(max(dot / np.sqrt(max(norm_a * norm_b, 1e-12)), -1.0), 1.0))
-            value += (turn / (TURN[0] + TURN[1] * gap)) ** 2
+            value += (np.arccos(min(max(along, -1.0), 1.0)) / turn_off) ** 2
         best = min(best, value)
     best += apart
     if best > most:
         return best
     backed = 0.0
     many = int(gap) + 1
+    # a cubic piece with such ends runs along a circle as near as can be
+    longer = 2.0 * gap / (1.0 + np.sqrt(max(0.5 + 0.5 * straight_dot, 0.0)))
     for m in range(many):
         t = (m + 0.5) / many
         wa, wb = 2 * t**3 - 3 * t**2 + 1, 3 * t**2 - 2 * t**3
-        va, vb = (t**3 - 2 * t**2 + t) * gap, (t**3 - t**2) * gap
+        va, vb = (t**3 - 2 * t**2 + t) * longer, (t**3 - t**2) * longer
         x = wa * place[a, 0] + va * out[a, 0] + wb * root_place[b, 0] - vb * root_out[b, 0] - origin[0]
         y = wa * place[a, 1] + va * out[a, 1] + wb * root_place[b, 1] - vb * root_out[b, 1] - origin[1]
         z = wa * place[a, 2] + va * out[a, 2] + wb * root_place[b, 2] - vb * root_out[b, 2] - origin[2]

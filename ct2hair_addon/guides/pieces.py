@@ -65,7 +65,7 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
     beside = (index[place] != index[end]) & (np.abs(np.einsum("nc,nc->n", tangents[place], tangents[end])) > 0.7)
     # the nearest, which the tree gives first
     nearest = np.unique(row[beside], return_index=True)[1]
-    kinks = np.flatnonzero(_kinks(lines.points, lines.offsets, voxel, _bend_weights()))
+    kinks = np.flatnonzero(_kinks(lines.points, lines.offsets, voxel, _course_weights()))
     cuts = np.unique(np.concatenate([place[beside][nearest], kinks]))
     cuts = cuts[(cuts - lines.offsets[index[cuts]] >= SHORTEST) & (lines.offsets[index[cuts] + 1] - cuts > SHORTEST)]
     cuts = cuts[_apart(cuts, SHORTEST)]
@@ -74,30 +74,41 @@ def cut_segments(segments: Strands, voxel: float) -> Pieces:
     return Pieces(Strands(lines.points, offsets), np.append(onward, -1).astype(np.int64), index[offsets[:-1]])
 
 
-def _bend_weights() -> np.ndarray:
-    """(KINK_SPAN + 1,): the second derivative of the parabola through as many places, a voxel apart, as their weighted sum."""
-    t = np.arange(KINK_SPAN + 1, dtype=np.float64)
-    return 2.0 * np.linalg.pinv(np.stack([np.ones_like(t), t, t * t], axis=1))[2]
+def _course_weights() -> np.ndarray:
+    """(2, KINK_SPAN + 1): of the parabola through as many places, a voxel apart, the direction in their middle and the second
+    derivative, as their weighted sums."""
+    t = np.arange(KINK_SPAN + 1, dtype=np.float64) - 0.5 * KINK_SPAN
+    fit = np.linalg.pinv(np.stack([np.ones_like(t), t, t * t], axis=1))
+    return np.stack([fit[1], 2.0 * fit[2]])
 
 
 @numba.njit(cache=True, parallel=True)
 def _kinks(points, offsets, voxel, weights):
-    """(M,) bool: where the bend before and the bend behind a point differ by more than KINK, and most for SHORTEST around."""
+    """(M,) bool: where the bend before and the bend behind a point, turned on to it as a circle's, differ by more than KINK,
+    and most for SHORTEST around."""
     out = np.zeros(len(points), np.bool_)
-    span = len(weights) - 1
+    span = weights.shape[1] - 1
     for n in numba.prange(len(offsets) - 1):
         start, end = offsets[n], offsets[n + 1]
         if end - start <= 2 * span:
             continue
         jump = np.zeros(end - start)
+        way, bend = np.empty((2, 3)), np.empty((2, 3))
         for m in range(start + span, end - span):
-            square = 0.0
-            for axis in range(3):
-                bend = 0.0
-                for k in range(span + 1):
-                    bend += weights[k] * (points[m + k, axis] - points[m - k, axis])
-                square += bend * bend
-            jump[m - start] = np.sqrt(square) / voxel
+            for side in range(2):
+                square = 0.0
+                for axis in range(3):
+                    way[side, axis] = bend[side, axis] = 0.0
+                    for k in range(span + 1):
+                        value = points[m + k, axis] if side else points[m - k, axis]
+                        way[side, axis] += weights[0, k] * value
+                        bend[side, axis] += weights[1, k] * value
+                    square += bend[side, axis] ** 2
+                curvature = np.sqrt(square) / voxel
+                turn = 0.5 * span * curvature
+                for axis in range(3):
+                    bend[side, axis] = (np.cos(turn) * bend[side, axis] + np.sin(turn) * curvature * way[side, axis]) / voxel
+            jump[m - start] = np.sqrt(np.square(bend[1] - bend[0]).sum())
         for m in range(span, end - start - span):
             if jump[m] > KINK:
                 most = True

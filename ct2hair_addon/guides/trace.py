@@ -37,7 +37,13 @@ TURN_COST = 0.8
 """Share of a strand's density that a turn by one radian in one step must win to be taken."""
 BEND_SPAN = 8
 """Steps between the three points of a path that its bend is taken from."""
-LEAST_BEND = 0.02
+LEAST_SPAN = 4
+"""And near its beginning at least."""
+SECANT, INERTIA = 4, 0.3
+"""Steps whose secant the direction leans on, and by which share."""
+HISTORY = 2 * BEND_SPAN + 1
+"""Points that tell the bend."""
+LEAST_BEND = 0.015
 """1/voxel; less is noise: a bend of this size and below is not looked ahead along."""
 OFF_COURSE = 4.0
 """Share of a strand's density that a step square to the hair's course must win to be taken, where the course is sure."""
@@ -97,26 +103,54 @@ WEIGHTS = np.linspace(1.0, 0.4, LOOK)
 
 
 @numba.njit(cache=True, nogil=True)
-def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path):
-    """Follow one way from (x, y, z) along d into `path` (n, 3) voxels; returns (points, reason)."""
+def _bend(path, count, dx, dy, dz):
+    """The bend (1/voxel) at the end of a path of `count` points that goes on along d: the circle's through three of its points,
+    square to d, less what noise may make; 0 where the path is too short to tell."""
+    span = min(BEND_SPAN, (count - 1) // 2)
+    if span < LEAST_SPAN:
+        return 0.0, 0.0, 0.0
+    p, q, r = path[count - 1], path[count - 1 - span], path[count - 1 - 2 * span]
+    ux, uy, uz = float(p[0] - q[0]), float(p[1] - q[1]), float(p[2] - q[2])
+    vx, vy, vz = float(q[0] - r[0]), float(q[1] - r[1]), float(q[2] - r[2])
+    nx, ny, nz = vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux
+    sides = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
+    third = (ux + vx) ** 2 + (uy + vy) ** 2 + (uz + vz) ** 2
+    curvature = 2.0 * np.sqrt((nx * nx + ny * ny + nz * nz) / max(sides * third, 1e-12))
+    bx, by, bz = ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx
+    noise = LEAST_BEND * BEND_SPAN**2 / max(curvature * span**2, 1e-9)
+    scale = curvature * max(1.0 - noise**2, 0.0) / max(np.sqrt(bx * bx + by * by + bz * bz), 1e-9)
+    return scale * bx, scale * by, scale * bz
+
+
+@numba.njit(cache=True, nogil=True)
+def _arc(curvature, step, far, aside):
+    """Fill `far` and `aside` with how far ahead, and to the side for each unit of bend, an arc is after 1, 2, ... steps."""
+    if curvature * step < 1e-3:
+        for k in range(len(far)):
+            far[k], aside[k] = (k + 1.0) * step, 0.5 * ((k + 1.0) * step) ** 2
+        return
+    cosine, sine = np.cos(curvature * step), np.sin(curvature * step)
+    c, s = 1.0, 0.0
+    for k in range(len(far)):
+        c, s = c * cosine - s * sine, s * cosine + c * sine
+        far[k], aside[k] = s / curvature, (1.0 - c) / curvature**2
+
+
+@numba.njit(cache=True, nogil=True)
+def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, path, known):
+    """Follow one way from (x, y, z) along d into `path` (n, 3) voxels, whose first `known` points, if any, led there; returns
+    (points, reason)."""
     whole, strands = weights.sum(), 1.0 / seen
-    count = 0
+    count = known
     start_x, start_y, start_z = x, y, z
-    scores = np.empty(len(fan))
+    scores, far, aside = np.empty(len(fan)), np.empty(len(weights)), np.empty(len(weights))
     while True:
         if count == len(path):
             return count, End.LONG
         ux, uy, uz, vx, vy, vz = plane(dx, dy, dz)
         # Hair goes on bending as it did: the look-ahead bends along, or in a curl it would see the neighbours.
-        bx = by = bz = 0.0
-        if count > 2 * BEND_SPAN:
-            p, q, r = path[count - 1], path[count - 1 - BEND_SPAN], path[count - 1 - 2 * BEND_SPAN]
-            bx, by, bz = p[0] - 2.0 * q[0] + r[0], p[1] - 2.0 * q[1] + r[1], p[2] - 2.0 * q[2] + r[2]
-            along = bx * dx + by * dy + bz * dz
-            bx, by, bz = bx - along * dx, by - along * dy, bz - along * dz
-            noise = (LEAST_BEND * (BEND_SPAN * step) ** 2) ** 2
-            scale = max(1.0 - noise / max(bx * bx + by * by + bz * bz, 1e-12), 0.0) / (BEND_SPAN * step) ** 2
-            bx, by, bz = scale * bx, scale * by, scale * bz
+        bx, by, bz = _bend(path, count, dx, dy, dz)
+        _arc(np.sqrt(bx * bx + by * by + bz * bz), 1.0, far, aside)
         best, chosen, backed = -1e30, 0, 0.0
         cx, cy, cz, trust = course_at(table, course, x, y, z)
         if abs(cx * dx + cy * dy + cz * dz) < OTHER_HAIR:
@@ -132,8 +166,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
             # from afar, where directions part: most are soon known not to come near the best, whatever lies between
             total, left, wanted = 0.0, MOST * whole, (best - ASIDE * SHARPNESS + cost) * whole
             for k in range(len(weights) - 1, -1, -1):
-                far, bent = k + 1.0, 0.5 * (k + 1.0) ** 2
-                px, py, pz = x + far * ex + bent * bx, y + far * ey + bent * by, z + far * ez + bent * bz
+                px, py, pz = x + far[k] * ex + aside[k] * bx, y + far[k] * ey + aside[k] * by, z + far[k] * ez + aside[k] * bz
                 total += weights[k] * min(density_at(table, bricks, px, py, pz) * strands, MOST)
                 left -= weights[k] * MOST
                 if total + left < wanted:
@@ -142,10 +175,14 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
             if scores[n] > best:
                 best, chosen, backed = scores[n], n, total / whole
         if backed < SUPPORT:
-            # The look-ahead sees the end before it is there: the last stretch, straight on.
-            for _ in range(len(weights) // 2):
-                x, y, z = x + step * dx, y + step * dy, z + step * dz
-                value = density_at(table, bricks, x, y, z) + density_at(table, bricks, x + dx, y + dy, z + dz)
+            # The look-ahead sees the end before it is there: the last stretch, along the same arc.
+            px, py, pz = x, y, z
+            _arc(np.sqrt(bx * bx + by * by + bz * bz), step, far, aside)
+            for k in range(len(weights) // 2):
+                x, y, z = px + far[k] * dx + aside[k] * bx, py + far[k] * dy + aside[k] * by, pz + far[k] * dz + aside[k] * bz
+                u, v, w = px + far[k + 1] * dx, py + far[k + 1] * dy, pz + far[k + 1] * dz
+                u, v, w = u + aside[k + 1] * bx, v + aside[k + 1] * by, w + aside[k + 1] * bz
+                value = density_at(table, bricks, x, y, z) + density_at(table, bricks, u, v, w)
                 if value < seen or count == len(path):
                     break
                 path[count, 0], path[count, 1], path[count, 2] = x, y, z
@@ -164,13 +201,15 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
         qx, qy, qz, _value = centred(table, bricks, x + step * ex, y + step * ey, z + step * ez, ex, ey, ez, 2, drawn * step)
-        # Inertia: the new direction leans on the last few steps' secant.
-        if count >= 4:
-            sx, sy, sz = qx - path[count - 4, 0], qy - path[count - 4, 1], qz - path[count - 4, 2]
+        # Inertia: the new direction leans on the last few steps' secant, turned on by half of their bend.
+        if count >= SECANT:
+            sx, sy, sz = qx - path[count - SECANT, 0], qy - path[count - SECANT, 1], qz - path[count - SECANT, 2]
         else:
             sx, sy, sz = qx - start_x, qy - start_y, qz - start_z
-        norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
-        ex, ey, ez = 0.7 * ex + 0.3 * sx * norm, 0.7 * ey + 0.3 * sy * norm, 0.7 * ez + 0.3 * sz * norm
+        norm, since = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9), 0.5 * SECANT * step
+        sx, sy, sz = sx * norm + since * bx, sy * norm + since * by, sz * norm + since * bz
+        norm = INERTIA / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
+        ex, ey, ez = (1.0 - INERTIA) * ex + norm * sx, (1.0 - INERTIA) * ey + norm * sy, (1.0 - INERTIA) * ez + norm * sz
         norm = 1.0 / np.sqrt(ex * ex + ey * ey + ez * ez)
         ex, ey, ez = ex * norm, ey * norm, ez * norm
         if ex * dx + ey * dy + ez * dz < turn:
@@ -178,7 +217,7 @@ def _follow(table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, w
         x, y, z, dx, dy, dz = qx, qy, qz, ex, ey, ez
         path[count, 0], path[count, 1], path[count, 2] = x, y, z
         count += 1
-        if count > 30 and (x - start_x) ** 2 + (y - start_y) ** 2 + (z - start_z) ** 2 < 1.0:
+        if count > known + 30 and (x - start_x) ** 2 + (y - start_y) ** 2 + (z - start_z) ** 2 < 1.0:
             return count, End.LOOP
 
 
@@ -288,6 +327,15 @@ def _alive(table, bricks, voxels, directions, seen):
     return alive
 
 
+@numba.njit(cache=True, nogil=True)
+def _turned(way, count, x, y, z, back):
+    """Begin `back` with the first `count` points of a way from (x, y, z), the last first, and that point; how many they are."""
+    for m in range(count):
+        back[count - 1 - m] = way[m]
+    back[count, 0], back[count, 1], back[count, 2] = x, y, z
+    return count + 1
+
+
 @numba.njit(cache=True, parallel=True)
 def _trace(
     table, bricks, course, voxels, directions, step, turn, seen, blur, fan, weights, widths, most, paths, firsts, counts, ends
@@ -301,21 +349,39 @@ def _trace(
         for _ in range(2):
             x, y, z, _value = centred(table, bricks, x, y, z, dx, dy, dz, 3, 0.7)
         middle = paths.shape[1] // 2
+        # A look ahead tells the way back which way it bends, and that the way ahead: neither sets out straight in a curl.
+        way, back_way = np.empty((middle + HISTORY, 3), np.float32), np.empty((middle + HISTORY, 3), np.float32)
         ahead, reason = _follow(
-            table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, paths[n, middle + 1 :]
+            table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, way[: HISTORY - 1], 0
         )
-        ends[n, 1] = reason
         # The way back sets out along the first steps' own direction, surer than the field's.
         if ahead >= 4:
-            sx, sy, sz = paths[n, middle + 4, 0] - x, paths[n, middle + 4, 1] - y, paths[n, middle + 4, 2] - z
+            sx, sy, sz = way[3, 0] - x, way[3, 1] - y, way[3, 2] - z
             norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
             dx, dy, dz = sx * norm, sy * norm, sz * norm
-        back_path = np.empty((middle, 3), np.float32)
-        back, reason = _follow(table, bricks, course, x, y, z, -dx, -dy, -dz, step, turn, seen, fan, weights, back_path)
+        known = _turned(way, ahead, x, y, z, back_way)
+        back, reason = _follow(
+            table, bricks, course, x, y, z, -dx, -dy, -dz, step, turn, seen, fan, weights, back_way[: known + middle], known
+        )
+        back -= known
+        back_way = back_way[known:]
         ends[n, 0] = reason
+        if back >= 4:
+            sx, sy, sz = x - back_way[3, 0], y - back_way[3, 1], z - back_way[3, 2]
+            norm = 1.0 / max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-9)
+            dx, dy, dz = sx * norm, sy * norm, sz * norm
+        known = _turned(back_way, min(back, HISTORY - 1), x, y, z, way)
+        ahead, reason = _follow(
+            table, bricks, course, x, y, z, dx, dy, dz, step, turn, seen, fan, weights, way[: known + middle], known
+        )
+        ahead -= known
+        way = way[known:]
+        ends[n, 1] = reason
         paths[n, middle, 0], paths[n, middle, 1], paths[n, middle, 2] = x, y, z
         for m in range(back):
-            paths[n, middle - 1 - m] = back_path[m]
+            paths[n, middle - 1 - m] = back_way[m]
+        for m in range(ahead):
+            paths[n, middle + 1 + m] = way[m]
         firsts[n] = middle - back
         counts[n, 0], counts[n, 1] = back, ahead
         path = smoothed(paths[n, middle - back : middle + ahead + 1], widths, most)

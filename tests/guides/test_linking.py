@@ -97,6 +97,35 @@ def test_a_gap_is_bridged_along_the_bend():
     assert 3.0 < bridged[0] < 12.0
 
 
+def coil(turns, radius=3.2, pitch=4.0):
+    """A helix, mm: 8 voxels of radius, about which hair turns right after its root in the tightest curls."""
+    angle = np.arange(0.0, 2.0 * np.pi * turns, 0.25 / radius)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), pitch / (2.0 * np.pi) * angle], axis=1)
+
+
+def test_a_gap_in_a_coil_is_bridged_around_it():
+    """A radian and a half of it: straight on from both ends lies 4 mm beside."""
+    whole = coil(3.0)
+    chains, _, bridged, tally = joined([whole[:90], whole[110:]], [whole], rooted=[0])
+    assert len(chains) == 1 and tally["joints made"] == 1
+    assert farthest(chains.points, whole) < 0.4
+    assert 4.0 < bridged[0] < 6.0
+
+
+def test_a_coil_costs_little_more_to_go_on_in_than_straight_hair():
+    """Along parabolas nothing was found 5 mm ahead, which is 12 voxels and half again a radian."""
+    whole, straight = coil(3.0), np.arange(0.0, 60.0, 0.25)[:, None] * [1.0, 0.0, 0.0]
+    for gap in (8, 20):
+        cost = []
+        for line in (straight, whole):
+            pieces = Strands.from_polylines([line[:90], line[90 + gap :]]).resampled_by_step(SPACING)
+            density = render_density(Strands.from_polylines([line]), SPACING, BLUR)
+            none = np.full(2, -1)
+            found = weighed_joints(pieces, np.zeros(2, bool), none, density, SEEN, 60.0)
+            cost.append(found.cost[(found.tip == 0) & (found.root == 1)].min())
+        assert cost[1] < cost[0] + 4.0
+
+
 def test_two_that_do_not_go_on_in_each_other_stay_apart():
     x = np.arange(0.0, 20.0, 0.25)[:, None]
     one, other = x * [1.0, 0, 0], [30.0, 0, 0] + x * [0, 1.0, 0]
@@ -159,6 +188,7 @@ def test_a_curl_that_turns_over_at_once_is_cut_there():
     assert len(pieces.strands) == 2 and pieces.onward.tolist() == [1, -1]
     np.testing.assert_allclose(pieces.strands.roots[1], arc[-1], atol=1.0)
     assert len(cut_segments(Strands.from_polylines([arc]), SPACING).strands) == 1
+    assert len(cut_segments(Strands.from_polylines([coil(4.0)]), SPACING).strands) == 1, "its bend turns on, as it did"
 
 
 def test_of_those_beside_an_end_the_nearest_is_cut():

@@ -70,14 +70,14 @@ def test_a_lone_strand_is_one_segment_on_its_centre_line(snr):
 
 @pytest.mark.parametrize(("apart", "pieces"), [(2.2, 3), (2.5, 1)])
 def test_neighbours_that_touch_are_both_found(apart, pieces):
-    """In one piece each; closer than 2.5 voxels the second one in several: what the first left of it is faint."""
+    """In one piece each; closer than 2.5 voxels the second one in several, with gaps: what the first left of it is faint."""
     beside = straight((8, 20 + apart, 20), (56, 20 + apart, 20))
     curves = [straight((8, 20, 20), (56, 20, 20)), beside, straight((8, 40, 40), (56, 44, 40))]
     lines, _, _ = traced(scan(curves, (64, 64, 64)))
     assert len(lines) <= 2 + pieces
     for curve in curves:
         near = np.array([distances(curve, line) < 0.7 for line in lines])
-        assert np.mean(near.any(axis=0)) > 0.8
+        assert np.mean(near.any(axis=0)) > (0.8 if pieces == 1 else 0.7)
         assert pieces > 1 or near.mean(axis=1).max() > 0.8
     assert sum(len(line) for line in lines) < 1.2 * sum(len(curve) for curve in curves)
 
@@ -107,6 +107,19 @@ def test_a_curl_keeps_its_radius(radius):
     found = max(traced(scan([curve], (64, 64, 64), snr=4.0))[0], key=len)[8:-8]
     assert len(found) > 100
     assert np.hypot(found[:, 0] - 32, found[:, 1] - 32).mean() == pytest.approx(radius, abs=0.1)
+
+
+@pytest.mark.parametrize("radius", [7.0, 8.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_tight_coil_is_one_segment(radius, seed):
+    """Within what is looked ahead it turns by a radian and more: a parabola would leave it, and traces ended on the way."""
+    t = np.linspace(0, 4 * np.pi, int(4.2 * np.pi * radius))
+    curve = np.stack([32 + radius * np.cos(t), 32 + radius * np.sin(t), 8 + 3.5 * t], 1)
+    whole = np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
+    found = traced(scan([curve], (64, 64, 64), snr=4.0, seed=seed))[0]
+    assert len(found) == 1
+    assert np.linalg.norm(np.diff(found[0], axis=0), axis=1).sum() > whole - 5.0
+    assert distances(found[0][3:-3], curve).mean() < 0.4  # it may run over the ends
 
 
 def test_noise_alone_gives_no_strand():
