@@ -39,6 +39,16 @@ class Pieces:
         onward[after[behind]] = before[behind]
         return Pieces(self.strands.reversed(back), onward, self.parent)
 
+    def cut(self, places: np.ndarray) -> Pieces:
+        """The pieces cut before some of their points (rising, none a piece's first); each goes on in what is cut off."""
+        offsets = np.sort(np.concatenate([self.strands.offsets, places]))
+        of = self.strands.strand_index[offsets[:-1]]
+        first = np.flatnonzero(np.isin(offsets[:-1], self.strands.offsets[:-1]))
+        onward = np.arange(1, len(of) + 1)
+        last = np.append(first[1:], len(of)) - 1
+        onward[last] = np.where(self.onward >= 0, first[self.onward], -1)
+        return Pieces(Strands(self.strands.points, offsets), onward, self.parent[of])
+
     def ends(self, fine: np.ndarray) -> np.ndarray:
         """(P,) int8: `fine` (N,) of the segments (1: the first point is a root, -1: the last one is) for the pieces."""
         out = np.zeros(len(self.onward), np.int8)

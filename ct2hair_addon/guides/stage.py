@@ -14,7 +14,7 @@ from ..settings import GuideSettings
 from ..strands import Strands, concatenate
 from ..volume.grid import BrickVolume
 from ..volume.strand_signal import StrandProfile, data_floor, support_along
-from .direction import fine_ends, roots_seen, signs
+from .direction import cut_where_turned, fine_ends, neighbour_votes, roots_seen, signs
 from .free_knots import usually_followed
 from .growing import follow_to_scalp, grow_to_root
 from .joints import meeting_ends
@@ -217,10 +217,15 @@ def root_segments(
     tally["poor segments"] = int((fine == 0).sum())
     progress(0.1, 1.0)
     if scan is not None and settings.link and len(segments):
-        pieces = cut_segments(segments, spacing)
-        fine = pieces.ends(fine)
+        pieces, fine_segments = cut_segments(segments, spacing), fine
+        fine = pieces.ends(fine_segments)
         seen = habit.seen if habit else roots_seen(pieces.strands, fine, head)
-        value = signs(pieces.strands, fine, head, settings, seen, meeting_ends(pieces, scan, strand))
+        votes = neighbour_votes(pieces.strands, settings.neighbour_radius)
+        value = signs(pieces.strands, fine, head, seen, votes)
+        pieces, votes = cut_where_turned(pieces, value, votes)
+        fine = pieces.ends(fine_segments)
+        value = signs(pieces.strands, fine, head, seen, votes, meeting_ends(pieces, scan, strand))
+        del votes
         progress(0.3, 1.0)
         known, merged = strands_by_knots(knots if counted else None, head, spacing)
         directed, rooted, bridged, joints = link_segments(
@@ -229,7 +234,7 @@ def root_segments(
         tally |= {"strands by the knots": known} | joints
     else:
         seen = habit.seen if habit else roots_seen(segments, fine, head)
-        value = signs(segments, fine, head, settings, seen)
+        value = signs(segments, fine, head, seen, neighbour_votes(segments, settings.neighbour_radius))
         directed, rooted, bridged = segments.reversed(value < 0), fine * value > 0.0, np.zeros(len(segments), np.float32)
     tally["seemingly rooted pieces that run the other way"] = int((fine * value < 0.0).sum())
     tally["pieces without a sure direction"] = int(((fine == 0) & (np.abs(value) < 0.1)).sum())

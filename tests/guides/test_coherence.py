@@ -7,6 +7,7 @@ import pytest
 from scipy.sparse import coo_matrix, csr_matrix
 
 from ct2hair_addon.guides.coherence import contracted, settled
+from ct2hair_addon.guides.direction import GAINS
 
 NEIGHBOURS = [(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)]
 
@@ -26,6 +27,12 @@ def signed_grid(side: int, planted: np.ndarray, lying: float, generator: np.rand
     return (graph + graph.T).tocsr()
 
 
+def mixed(generator: np.random.Generator, graph: csr_matrix, *of_nodes: np.ndarray):
+    """The same with its nodes in any order, as pieces come: none is asked before the one beside it."""
+    order = generator.permutation(graph.shape[0])
+    return graph[order][:, order], *(values[order] for values in of_nodes)
+
+
 @pytest.mark.parametrize("side", [4, 40])
 def test_signs_without_contradiction_are_found_exactly(side):
     generator = np.random.default_rng(side)
@@ -43,12 +50,46 @@ def test_one_bond_in_twenty_that_lies_costs_few_signs_and_no_walls():
     # what each node holds for itself is mostly wrong, far from where the truth is known
     field = 0.005 * planted * np.where(np.arange(3600) < 1400, 1.0, -0.6)
     assert (planted * field).sum() > 0.0
+    graph, planted, field = mixed(generator, graph, planted, field)
     scale, nobody = np.asarray(abs(graph).sum(axis=1)).ravel(), np.zeros(3600, bool)
     sign = contracted(graph, field)
     assert np.mean(sign == planted) > 0.9
     assert np.mean(np.sign(settled(graph, scale, sign, nobody)) == planted) > 0.99
     nearby = settled(graph, scale, np.zeros(3600), nobody, field / scale)
     assert np.mean(np.sign(nearby) == planted) < 0.6
+
+
+def test_what_settles_is_what_each_node_hears():
+    generator = np.random.default_rng(11)
+    planted = generator.choice([-1.0, 1.0], 900)
+    graph = signed_grid(30, planted, 0.1, generator)
+    scale = np.asarray(abs(graph).sum(axis=1)).ravel()
+    sure = generator.random(900) < 0.05
+    hint = 0.1 * generator.normal(size=900)
+    for gain in (1.1, 3.0):
+        value = settled(graph, scale, planted * sure, sure, hint, gain)
+        np.testing.assert_array_equal(value[sure], planted[sure])
+        heard = np.tanh(gain * (graph @ value / scale + hint))
+        np.testing.assert_allclose(value[~sure], heard[~sure], atol=0.01)
+    assert np.mean(np.sign(value) == planted) > 0.97
+
+
+def test_signs_that_grow_certain_together_leave_no_walls_where_fronts_met():
+    """Of those that are sure, in two rows along one side, one in four is wrong, and one bond in five lies."""
+    found = []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        graph = signed_grid(60, np.ones(3600), 0.2, generator)
+        start = np.zeros(3600)
+        start[:120] = np.where(generator.random(120) < 0.25, -1.0, 1.0)
+        graph, start = mixed(generator, graph, start)
+        scale, sure = np.asarray(abs(graph).sum(axis=1)).ravel(), start != 0
+        value = start
+        for gain in GAINS:
+            value = settled(graph, scale, value, sure, gain=gain)
+        found.append([np.mean(signs[~sure] > 0) for signs in (settled(graph, scale, start, sure), value)])
+    at_once, together = np.mean(found, axis=0)
+    assert together > 0.95 > 0.8 > at_once
 
 
 def test_small_graphs_come_close_to_the_best_signs_of_all():

@@ -216,6 +216,21 @@ def test_pieces_turned_against_each_other_do_not_go_on_in_each_other():
     assert pieces.ends(np.array([-1, 0], np.int8))[:cut].tolist() == [0] * (cut - 1) + [-1]
 
 
+def test_pieces_cut_go_on_in_what_is_cut_off():
+    x = np.arange(0.0, 40.0, 0.25)[:, None]
+    line, beside = x * [1.0, 0, 0], [20.0, 0.5, 0] + x[:40] * [1.0, 0, 0]
+    pieces = cut_segments(Strands.from_polylines([line, beside]), SPACING)
+    count, chain = len(pieces.strands), int((pieces.parent == 0).sum())
+    place = pieces.strands.offsets[[0, 1, count - 1]] + [10, 15, 8]
+    cut = pieces.cut(place)
+    assert cut.onward.tolist() == [*range(1, chain + 2), -1, chain + 3, -1]
+    assert cut.parent.tolist() == [0] * (chain + 2) + [1] * 2
+    np.testing.assert_array_equal(cut.strands.points, pieces.strands.points)
+    np.testing.assert_array_equal(cut.strands.roots[[1, 3]], pieces.strands.points[place[:2]])
+    same = pieces.cut(place[:0])
+    assert same.onward.tolist() == pieces.onward.tolist() and same.parent.tolist() == pieces.parent.tolist()
+
+
 def test_ends_that_meet_say_whether_they_run_the_same_way():
     angle = np.linspace(0, 2.0, 200)
     arc = 20.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)

@@ -5,9 +5,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ct2hair_addon.evaluation import render_density
-from ct2hair_addon.guides import Habit, root_segments
-from ct2hair_addon.guides.direction import fine_ends, roots_seen, signs
+from ct2hair_addon.guides import Habit, direction, root_segments
+from ct2hair_addon.guides.direction import cut_where_turned, fine_ends, neighbour_votes, roots_seen, signs
 from ct2hair_addon.guides.growing import follow_to_scalp, grow_to_root
+from ct2hair_addon.guides.pieces import cut_segments
 from ct2hair_addon.guides.roots import lead_into_scalp, push_out
 from ct2hair_addon.head import Head
 from ct2hair_addon.settings import GuideSettings
@@ -31,6 +32,10 @@ def hair(azimuth: float, start: float, end: float, lift=0.5) -> np.ndarray:
     return root + s[:, None] * away + (s**2 * 0.004)[:, None] * (outwards - [0, 0, 1.0])
 
 
+def votes_of(strands: Strands) -> direction.Votes:
+    return neighbour_votes(strands, GuideSettings().neighbour_radius)
+
+
 def test_a_long_segment_from_the_scalp_is_fine_and_a_far_one_poor(ball):
     lines = [hair(0.0, 2, 90), hair(0.1, 2, 90)[::-1], hair(0.2, 30, 90), hair(0.3, 5, 25), hair(0.4, 2, 12)]
     strands = Strands.from_polylines(lines)
@@ -42,7 +47,7 @@ def test_poor_segments_take_the_direction_of_their_neighbours(ball):
     lines += [hair(a, 30, 70)[:: (-1 if n % 2 else 1)] for n, a in enumerate(np.linspace(0.01, 0.29, 11))]
     strands = Strands.from_polylines(lines)
     fine = fine_ends(strands, ball, GuideSettings())
-    value = signs(strands, fine, ball, GuideSettings(), roots_seen(strands, fine, ball))
+    value = signs(strands, fine, ball, roots_seen(strands, fine, ball), votes_of(strands))
     assert (value[:12] > 0).all()
     assert (np.sign(value[12:]) == [-1 if n % 2 else 1 for n in range(11)]).all()
 
@@ -56,7 +61,59 @@ def test_what_crosses_at_an_angle_has_no_say_against_what_runs_alongside(ball):
     crossing = [across + [0.0, 0.0, z] for z in np.arange(0.0, 40.0)]
     strands = Strands.from_polylines([along, along + [1.5, 0.0, 0.0], along - [1.5, 0.0, 0.0], *crossing])
     known = np.array([0, 1, 1, *[1] * len(crossing)], np.int8)
-    assert signs(strands, known, ball, GuideSettings(), True)[0] > 0.1
+    assert signs(strands, known, ball, True, votes_of(strands))[0] > 0.1
+
+
+def test_what_stands_alone_goes_by_its_climb_the_surer_the_more_that_is_worth_in_the_wig(ball):
+    """Where all hair runs away from the head, and where that of one tuft in three is known to run towards it."""
+    lines = [hair(0.4 * n, 2, 60) for n in range(12)] + [hair(0.4 * n + 0.01, 5, 60) for n in range(12)] + [hair(0.2, 20, 60)]
+    strands, votes = Strands.from_polylines(lines), votes_of(Strands.from_polylines(lines))
+    assert votes.bonds[24].nnz == 0
+    alone = []
+    for falling in (0, 4):
+        fine = np.array([-1] * falling + [1] * (12 - falling) + [0] * 13, np.int8)
+        value = signs(strands, fine, ball, True, votes)
+        assert (np.sign(value[12:24]) == fine[:12]).all()
+        alone.append(value[24])
+    assert alone[0] > 0.5 > alone[1] > 0.0
+
+
+def test_the_worth_of_a_climb_is_the_slope_of_its_log_odds():
+    generator = np.random.default_rng(0)
+    climb, lengths = generator.uniform(-1.0, 1.0, 40_000), generator.uniform(1.0, 60.0, 40_000)
+    for slope in (0.0, 3.0, 9.0):
+        sign = np.where(generator.random(40_000) < 1.0 / (1.0 + np.exp(-slope * climb)), 1.0, -1.0)
+        assert direction._worth(climb, sign, lengths) == pytest.approx(slope, abs=0.05 * slope + 0.06)
+    assert direction._worth(climb, np.sign(climb), lengths) > 0.8 * direction.WORTH
+    assert direction._worth(climb, -np.sign(climb), lengths) == 0.0
+    assert direction._worth(climb[:0], climb[:0], lengths[:0]) <= direction.WORTH
+
+
+def test_a_trace_that_goes_over_to_hair_that_runs_the_other_way_is_cut_there(ball):
+    """Two tufts whose tips meet head-on, and a trace through both; one that stays in its own is left whole."""
+    x = np.arange(0.0, 80.1, 0.4)[:, None] * [1.0, 0.0, 0.0]
+    beside = [[0.0, 1.1 * n, 0.0] for n in (-3, -2, -1, 1, 2, 3)]
+    tufts = [x[:100] + over for over in beside] + [x[:99:-1] + over for over in beside]
+    lines = [line + [0.0, 0.0, RADIUS + 20.0] for line in [x, x[:100] + [0.0, 0.0, 1.1], *tufts]]
+    pieces = cut_segments(Strands.from_polylines(lines), 0.4)
+    assert pieces.parent.tolist() == [*range(14)]
+    fine = np.array([0, 0] + [1] * 12, np.int8)
+    votes = votes_of(pieces.strands)
+    value = signs(pieces.strands, fine, ball, True, votes)
+    cut, heard = cut_where_turned(pieces, value, votes)
+    assert cut.parent.tolist() == [0, *range(14)] and cut.onward.tolist() == [1] + [-1] * 14
+    assert cut.strands.roots[1, 0] == pytest.approx(40.0, abs=1.5)
+    # what was heard is the same, and is now heard by one part or the other
+    assert len(heard.strand) == len(votes.strand)
+    onto = np.zeros((15, 14))
+    onto[np.arange(15), cut.parent] = 1.0
+    np.testing.assert_allclose(onto.T @ heard.bonds.toarray() @ onto, votes.bonds.toarray(), atol=1e-4)
+    told = signs(cut.strands, cut.ends(fine), ball, True, heard)
+    assert told[0] > 0.5 and told[1] < -0.5
+    turned = cut.turned(told < 0)
+    assert turned.onward.tolist() == [-1] * 15
+    whole, same = cut_where_turned(cut, told, heard)
+    assert len(whole.strands) == 15 and (same.bonds != heard.bonds).nnz == 0
 
 
 def coiled(azimuth: float, lands: bool) -> np.ndarray:
@@ -82,7 +139,7 @@ def test_where_hair_lies_flat_and_comes_back_to_the_scalp_all_of_it_together_tel
     fine = fine_ends(strands, ball, GuideSettings())
     true = np.where(turned, -1, 1)
     assert (fine * true < 0).sum() > 3 * (fine * true > 0).sum()  # tips that land look like roots, and roots don't
-    value = signs(strands, fine, ball, GuideSettings(), roots_seen(strands, fine, ball))
+    value = signs(strands, fine, ball, roots_seen(strands, fine, ball), votes_of(strands))
     assert np.mean(np.sign(value) == true) > 0.97
     # fitted guides have been led to the scalp, and their roots are no more to be trusted: it is said which wig it is
     assert not roots_seen(strands, fine, ball)
